@@ -1,0 +1,1 @@
+"""What decides: controllers, all behind one protocol."""

@@ -1,0 +1,147 @@
+"""The networks: an actor that flies and a critic that predicts reward, both 17-64-64 with tanh (paper R16)."""
+
+import json
+import struct
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Literal
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import safetensors
+import safetensors.numpy
+from jaxtyping import Array, Float
+
+from flytune.errors import BadInput
+from flytune.pytree import label, pytree, static
+from flytune.task import observation
+
+FORMAT = "flytune-policy-1"
+
+
+@pytree
+class Network:
+    """A multilayer perceptron with tanh between its layers and none after the last."""
+
+    weights: tuple[Float[Array, "inputs outputs"], ...]
+    biases: tuple[Float[Array, "outputs"], ...]
+
+    def __call__(self, inputs: Float[Array, "*batch inputs"]) -> Float[Array, "*batch outputs"]:
+        """The outputs for one input or a batch of them."""
+        for weight, bias in zip(self.weights[:-1], self.biases[:-1], strict=True):
+            inputs = jnp.tanh(inputs @ weight + bias)
+        return inputs @ self.weights[-1] + self.biases[-1]
+
+
+def make_network(key: jax.Array, sizes: Sequence[int], last_gain: float) -> Network:
+    """A network with orthogonal weights (gain sqrt 2, and `last_gain` in the last layer) and zero biases.
+
+    Source: the initialisation of Stable-Baselines3's actor-critic (paper R17).
+    """
+    gains = [2**0.5] * (len(sizes) - 2) + [last_gain]
+    keys = jax.random.split(key, len(gains))
+    shapes = list(zip(sizes[:-1], sizes[1:], strict=True))
+    return Network(
+        weights=tuple(
+            jax.nn.initializers.orthogonal(gain)(k, shape) for k, gain, shape in zip(keys, gains, shapes, strict=True)
+        ),
+        biases=tuple(jnp.zeros(size) for size in sizes[1:]),
+    )
+
+
+@pytree
+class Policy:
+    """A learned pilot: the deterministic action of its actor, squashed into [-1, 1].
+
+    `clip` cuts a Gaussian policy's mean (PPO); `tanh` squashes smoothly (analytic policy gradient).
+    """
+
+    actor: Network
+    input_scale: Float[Array, "17"]  # what the observation is multiplied with before the actor sees it
+    squash: Literal["clip", "tanh"] = static()
+    about: dict[str, Any] = label(default_factory=dict)  # task, vehicle, trainer: what the file's header says
+
+    def __call__(self, observation: Float[Array, "*batch 17"]) -> Float[Array, "*batch 4"]:
+        """The action in [-1, 1] for one observation or a batch of them."""
+        raw = self.actor(observation * self.input_scale)
+        return jnp.tanh(raw) if self.squash == "tanh" else jnp.clip(raw, -1.0, 1.0)
+
+    def initial_memory(self) -> tuple[()]:
+        """Nothing: the policy is a function of the observation alone."""
+        return ()
+
+    def act(self, memory: tuple[()], observation: Float[Array, "17"]) -> tuple[tuple[()], Float[Array, "4"]]:
+        """The action of one observation, see `Controller`."""
+        return memory, self(observation)
+
+
+def save_policy(path: Path, policy: Policy) -> None:
+    """Write a policy as safetensors; its header carries the observation, the action and what `about` says."""
+    tensors = {"input_scale": np.asarray(policy.input_scale)}
+    for index, (weight, bias) in enumerate(zip(policy.actor.weights, policy.actor.biases, strict=True)):
+        tensors[f"actor.{index}.weight"] = np.asarray(weight)
+        tensors[f"actor.{index}.bias"] = np.asarray(bias)
+    header = {
+        "format": FORMAT,
+        "squash": policy.squash,
+        "observation": observation.LAYOUT,
+        "action": "4 motors [-1, 1]: rotor speed = hover speed * (1 + action_scale * action); "
+        "0 (+x, -y), 1 (-x, -y), 2 (-x, +y), 3 (+x, +y)",
+        "rate": "100 Hz",
+        "about": json.dumps(policy.about, sort_keys=True),
+    }
+    whole = path.with_name(path.name + ".part")
+    safetensors.numpy.save_file(tensors, whole, metadata=header)
+    whole.replace(path)
+
+
+def load_policy(path: Path) -> Policy:
+    """A policy from its file.
+
+    Raises:
+        BadInput: missing, not a policy, of another observation layout, wrongly shaped, or not finite.
+    """
+    try:
+        with safetensors.safe_open(path, framework="numpy") as file:
+            header = file.metadata() or {}
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118  (not a dict)
+    except FileNotFoundError:
+        raise BadInput(f"{path}: no such file. Give a run directory or a .safetensors policy.") from None
+    except (safetensors.SafetensorError, OSError, struct.error) as error:
+        raise BadInput(f"{path}: is not a policy ({error}). Give a .safetensors file written by flytune.") from None
+    if header.get("format") != FORMAT:
+        raise BadInput(f"{path}: is not a flytune policy (format {header.get('format')!r}). Allowed: {FORMAT}.")
+    if header.get("observation") != observation.LAYOUT:
+        raise BadInput(
+            f"{path}: was trained on another observation, {header.get('observation')!r}. "
+            f"Allowed: {observation.LAYOUT}. Train it again with this version."
+        )
+    return _assemble(path, header, tensors)
+
+
+def _assemble(path: Path, header: dict[str, str], tensors: dict[str, np.ndarray]) -> Policy:
+    layers = (len(tensors) - 1) // 2
+    names = {"input_scale", *(f"actor.{i}.{part}" for i in range(layers) for part in ("weight", "bias"))}
+    if layers < 1 or set(tensors) != names or header.get("squash") not in ("clip", "tanh"):
+        raise BadInput(f"{path}: is a damaged policy (tensors {sorted(tensors)}). Train it again.")
+    sizes = [observation.SIZE, *(tensors[f"actor.{i}.weight"].shape[-1] for i in range(layers))]
+    for index in range(layers):
+        wanted = (sizes[index], sizes[index + 1])
+        weight, bias = tensors[f"actor.{index}.weight"], tensors[f"actor.{index}.bias"]
+        if weight.shape != wanted or bias.shape != wanted[1:]:
+            raise BadInput(f"{path}: layer {index} has shape {weight.shape}, allowed: {wanted}. Train it again.")
+    if sizes[-1] != 4 or tensors["input_scale"].shape != (observation.SIZE,):
+        raise BadInput(f"{path}: maps {tensors['input_scale'].shape} to {sizes[-1]}, allowed: 17 to 4. Train it again.")
+    for name, tensor in tensors.items():
+        if not np.all(np.isfinite(tensor)):
+            raise BadInput(f"{path}: {name} holds numbers that are not finite. Train it again.")
+    return Policy(
+        actor=Network(
+            weights=tuple(jnp.asarray(tensors[f"actor.{i}.weight"]) for i in range(layers)),
+            biases=tuple(jnp.asarray(tensors[f"actor.{i}.bias"]) for i in range(layers)),
+        ),
+        input_scale=jnp.asarray(tensors["input_scale"]),
+        squash=header["squash"],  # pyright: ignore[reportArgumentType]  (checked above)
+        about=json.loads(header.get("about", "{}")),
+    )

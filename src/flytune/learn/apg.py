@@ -1,0 +1,126 @@
+"""Analytic policy gradient: gradient ascent on the reward, back-propagated through the differentiable simulator.
+
+One update flies `environments` episodes for `window` steps and differentiates their mean reward, without discount or
+critic, with respect to the actor's weights. Episodes carry over from update to update. The termination conditions act
+as a barrier on their margins, a smooth function where their end of an episode has no gradient.
+"""
+
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import optax
+from jaxtyping import Array, Float
+
+from flytune import env
+from flytune.control.policy import Network, Policy, make_network
+from flytune.env import Episode
+from flytune.pytree import pytree
+from flytune.task.observation import SIZE, draw_noise
+from flytune.task.task import Task
+from flytune.task.termination import causes
+from flytune.task.training import ApgSettings
+
+
+@pytree
+class Learner:
+    """Everything an update needs and changes."""
+
+    actor: Network
+    average: Network  # exponential moving average of the actor over updates; the one that is flown
+    optimiser: Any
+    episodes: Episode  # a batch of them
+    key: Array
+    updates: Array
+
+
+def policy(learner: Learner) -> Policy:
+    """The policy that is flown: the averaged actor."""
+    return Policy(actor=learner.average, input_scale=jnp.ones(SIZE), squash="tanh")
+
+
+def last_policy(learner: Learner) -> Policy:
+    """The policy of the last update."""
+    return Policy(actor=learner.actor, input_scale=jnp.ones(SIZE), squash="tanh")
+
+
+def _optimiser(settings: ApgSettings) -> optax.GradientTransformation:
+    rate = optax.cosine_decay_schedule(settings.learning_rate, settings.updates, settings.final_learning_rate)
+    return optax.chain(
+        optax.clip_by_global_norm(settings.gradient_norm),
+        optax.adam(rate, b1=settings.momentum, b2=settings.second_momentum),
+    )
+
+
+@partial(jax.jit, static_argnames="settings")
+def start(task: Task, settings: ApgSettings, key: Array) -> Learner:
+    """A learner before its first update."""
+    actor_key, episode_key, key = jax.random.split(key, 3)
+    actor = make_network(actor_key, (SIZE, *settings.hidden, 4), last_gain=0.01)
+    episodes = jax.vmap(partial(env.reset, task))(jax.random.split(episode_key, settings.environments))
+    return Learner(
+        actor=actor,
+        average=actor,
+        optimiser=_optimiser(settings).init(actor),
+        episodes=episodes,
+        key=key,
+        updates=jnp.zeros((), jnp.int32),
+    )
+
+
+def barrier(margin: Float[Array, ""], settings: ApgSettings) -> Float[Array, ""]:
+    """What a margin costs: weight * max(0, barrier_margin - margin)^2, nothing while more than that is left."""
+    return settings.barrier_weight * jnp.maximum(settings.barrier_margin - margin, 0.0) ** 2
+
+
+@partial(jax.jit, static_argnames="settings", donate_argnames="learner")
+def update(task: Task, settings: ApgSettings, learner: Learner) -> tuple[Learner, dict[str, Any]]:
+    """The learner after one update, and what it saw: reward, terms, terminations, lengths of finished episodes."""
+    key, flight_key = jax.random.split(learner.key)
+    (_, (episodes, seen)), gradient = jax.value_and_grad(_loss, argnums=2, has_aux=True)(
+        task, settings, learner.actor, learner.episodes, flight_key
+    )
+    change, optimiser = _optimiser(settings).update(gradient, learner.optimiser, learner.actor)
+    actor: Network = optax.apply_updates(learner.actor, change)  # pyright: ignore[reportAssignmentType]
+    # the average starts as the mean of what there is, and forgets at its own rate only later
+    keep = jnp.minimum(settings.average, learner.updates / (learner.updates + 1.0))
+    average = jax.tree.map(lambda old, new: keep * old + (1 - keep) * new, learner.average, actor)
+    seen["gradient_norm"] = optax.global_norm(gradient)
+    after = Learner(
+        actor=actor,
+        average=average,
+        optimiser=optimiser,
+        episodes=episodes,
+        key=key,
+        updates=learner.updates + 1,
+    )
+    return after, seen
+
+
+def _loss(task: Task, settings: ApgSettings, actor: Network, episodes: Episode, key: Array) -> Any:
+    """Mean cost per step of the whole batch, and the episodes it ends with."""
+
+    def one(episode: Episode, key: Array) -> Any:
+        def advance(episode: Episode, key: Array) -> Any:
+            noise_key, reset_key = jax.random.split(key)
+            seen = env.look(task, episode, draw_noise(noise_key))
+            moved, outcome = env.step(task, episode, jnp.tanh(actor(seen)))
+            cost = sum((barrier(margin, settings) for margin in outcome.margins.values()), start=jnp.zeros(()))
+            return env.autoreset(task, moved, outcome, reset_key), (outcome.reward - cost, outcome, moved.steps)
+
+        return jax.lax.scan(advance, episode, jax.random.split(key, settings.window))
+
+    keys = jax.random.split(key, settings.environments)
+    episodes, (worth, outcome, steps) = jax.vmap(one)(episodes, keys)
+    ended = outcome.terminated | outcome.truncated
+    number = len(causes(task.termination))
+    seen = {
+        "objective": jnp.mean(worth),
+        "reward": jnp.mean(outcome.reward),
+        "terms": jax.tree.map(jnp.mean, outcome.terms),
+        "terminations": jnp.sum(jax.nn.one_hot(outcome.cause, number), axis=(0, 1)),
+        "episodes": jnp.sum(ended),
+        "episode_length": jnp.sum(jnp.where(ended, steps, 0)) / jnp.maximum(jnp.sum(ended), 1),
+    }
+    return -jnp.mean(worth), (episodes, seen)

@@ -1,0 +1,34 @@
+"""Frozen dataclasses that JAX can look into: numbers are leaves, structure is static, labels are left out."""
+
+import dataclasses
+from typing import Any, TypeVar, dataclass_transform
+
+import jax
+from pydantic import ConfigDict
+
+T = TypeVar("T")
+
+
+def static(**options: Any) -> Any:
+    """A field that belongs to the structure: another value compiles another program."""
+    return dataclasses.field(metadata={"static": True}, **options)
+
+
+def label(**options: Any) -> Any:
+    """A field for people (a name, a source): it needs a default, and compiled code sees that default."""
+    return dataclasses.field(metadata={"label": True}, **options)
+
+
+@dataclass_transform(frozen_default=True, kw_only_default=True, field_specifiers=(dataclasses.field, static, label))
+def pytree(cls: type[T]) -> type[T]:
+    """The class as a frozen, keyword-only dataclass, registered as a JAX pytree.
+
+    Read from a file (`document.read`), unknown keys are refused.
+    """
+    made: Any = dataclasses.dataclass(frozen=True, kw_only=True)(cls)
+    made.__pydantic_config__ = ConfigDict(extra="forbid")
+    fields = dataclasses.fields(made)
+    structure = [field.name for field in fields if field.metadata.get("static")]
+    labels = [field.name for field in fields if field.metadata.get("label")]
+    numbers = [field.name for field in fields if field.name not in structure and field.name not in labels]
+    return jax.tree_util.register_dataclass(made, data_fields=numbers, meta_fields=structure, drop_fields=labels)

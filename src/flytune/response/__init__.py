@@ -1,0 +1,1 @@
+"""How a flight is judged: trials are flown, measured and summarised, whoever the pilot was."""

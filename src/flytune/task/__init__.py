@@ -1,0 +1,1 @@
+"""What is wanted: reward, terminations, observation, initial states, and the task that holds them."""

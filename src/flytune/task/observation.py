@@ -1,0 +1,66 @@
+"""The 17 numbers a pilot sees, and their noise (paper R7, R8)."""
+
+from typing import Annotated
+
+import jax
+import jax.numpy as jnp
+from annotated_types import Ge, Unit
+from jaxtyping import Array, Float
+
+from flytune.document import Real
+from flytune.physics import rotation
+from flytune.physics.dynamics import State
+from flytune.pytree import pytree
+from flytune.task.situation import Target, attitude_error
+
+SIZE = 17
+NOISY = 13  # the first 13 carry noise; the last action does not
+LAYOUT = (
+    "position_error (3) [m], attitude_error (4) [x y z w], velocity (3) [m/s, inertial], "
+    "body_rate (3) [rad/s, body], last_action (4)"
+)
+
+
+@pytree
+class ObservationNoise:
+    """Standard deviations of the Gaussian noise on each block of the observation."""
+
+    position: Annotated[Real, Ge(0), Unit("m")]
+    attitude: Annotated[Real, Ge(0), Unit("1")]  # on each of the four quaternion components
+    velocity: Annotated[Real, Ge(0), Unit("m/s")]
+    body_rate: Annotated[Real, Ge(0), Unit("rad/s")]
+
+
+def observe(
+    target: Target,
+    noise: ObservationNoise,
+    state: State,
+    last_action: Float[Array, "4"],
+    normal: Float[Array, "13"],
+) -> Float[Array, "17"]:
+    """What the pilot sees of a true state: [e_p, q_e, v, w, a_{t-1}].
+
+    Args:
+        target: where to hover.
+        noise: standard deviations.
+        state: the true state.
+        last_action: the action before, in [-1, 1].
+        normal: standard normal numbers; zeros give the noise-free observation.
+
+    Source: paper R7, R8. Reading: the quaternion is flipped, then noise is added, then it is normalised.
+    """
+    e, q, v, w = jnp.split(normal, (3, 7, 10))
+    return jnp.concatenate(
+        [
+            state.position - jnp.stack(target.position) + noise.position * e,
+            rotation.normalise(attitude_error(target, state.attitude) + noise.attitude * q),
+            state.velocity + noise.velocity * v,
+            state.body_rate + noise.body_rate * w,
+            last_action,
+        ]
+    )
+
+
+def draw_noise(key: jax.Array) -> Float[Array, "13"]:
+    """Standard normal numbers for one observation."""
+    return jax.random.normal(key, (NOISY,))

@@ -1,0 +1,109 @@
+"""Task: everything that is wanted, in one file."""
+
+from importlib import resources
+from pathlib import Path
+from typing import Annotated, Any
+
+from annotated_types import Ge, Gt, Unit
+
+from flytune import document
+from flytune.document import Real, Whole
+from flytune.errors import BadInput
+from flytune.physics.vehicle import Vehicle, vehicle_table
+from flytune.pytree import label, pytree
+from flytune.task.initial_state import InitialState
+from flytune.task.observation import ObservationNoise
+from flytune.task.reward import RewardTerm
+from flytune.task.situation import Target
+from flytune.task.termination import MaximumSpeed, Termination
+from flytune.task.training import ApgSettings, PpoSettings
+
+
+@pytree
+class Task:
+    """What a pilot is asked to do, with which vehicle, and how it is trained for it."""
+
+    name: str = label(default="custom")
+    horizon: Annotated[Whole, Ge(1), Unit("control steps of 0.01 s")]  # a training episode is truncated after these
+    duration: Annotated[Real, Gt(0.5), Unit("s")] = label(default=10.0)  # of a trial in evaluation
+    target: Target
+    initial_state: InitialState
+    noise: ObservationNoise
+    reward: dict[str, RewardTerm]
+    termination: dict[str, Termination]
+    vehicle: Vehicle
+    ppo: PpoSettings = label(default_factory=PpoSettings)
+    apg: ApgSettings = label(default_factory=ApgSettings)
+    sources: dict[str, str] = label(default_factory=dict)
+
+    @property
+    def speed_bound(self) -> float | None:
+        """The tightest speed termination in m/s, or None where there is none."""
+        bounds = [float(end.bound) for end in self.termination.values() if isinstance(end, MaximumSpeed)]
+        return min(bounds, default=None)
+
+    def problem(self) -> str | None:
+        """What makes the numbers impossible together, or None."""
+        if not self.reward:
+            return "reward: no term. Allowed: one or more tables [reward.NAME]."
+        return None
+
+
+def preset_names() -> list[str]:
+    """The tasks that ship with flytune."""
+    folder = resources.files("flytune.task") / "presets"
+    return sorted(entry.name.removesuffix(".toml") for entry in folder.iterdir() if entry.name.endswith(".toml"))
+
+
+def load_task(task: str | Path, edits: dict[str, Any] | None = None) -> Task:
+    """A task by preset name or TOML file, with edits applied.
+
+    Args:
+        task: `baseline`, `acrobatic`, `inspection`, or the path of a .toml file.
+        edits: field path -> value, for instance {"reward.velocity.weight": 0.08}; `vehicle` also takes a name.
+
+    Raises:
+        BadInput: unknown, unreadable, or not a task; one line that names the field.
+    """
+    name = str(task)
+    if name in preset_names():
+        with resources.as_file(resources.files("flytune.task") / "presets" / f"{name}.toml") as path:
+            data = {"name": name, **document.load(path)}
+        where = ""
+    elif name.endswith(".toml") or Path(name).is_file():
+        data = {"name": Path(name).stem, **document.load(Path(name))}
+        where = name
+    else:
+        hint = document.nearest(name, preset_names())
+        raise BadInput(
+            f"task: {name!r} is no preset. Allowed: {', '.join(preset_names())}, or a .toml file."
+            + (f" Did you mean {hint}?" if hint else "")
+        )
+    complete = document.plain(document.read(Task, _with_vehicle(data), where))
+    if not edits:
+        return document.read(Task, complete, where)
+    for path, value in edits.items():
+        complete = _edited(complete, path, value)
+    return document.read(Task, complete)
+
+
+def write_task(task: Task) -> str:
+    """The TOML text of a task: exact, complete, and with unit, range and source beside each number."""
+    sources = dict(task.sources) | {f"vehicle.{path}": text for path, text in task.vehicle.sources.items()}
+    return document.write(task, sources, heading=f"flytune task {task.name}: value  # unit; allowed; source")
+
+
+def _with_vehicle(data: dict[str, Any]) -> dict[str, Any]:
+    vehicle = data.get("vehicle")
+    return {**data, "vehicle": vehicle_table(vehicle)} if isinstance(vehicle, str) else data
+
+
+def _edited(data: dict[str, Any], path: str, value: Any) -> dict[str, Any]:
+    """The task's tables after one edit, the source of what was edited now the user."""
+    if path == "vehicle" and isinstance(value, str):
+        return {**data, "vehicle": vehicle_table(value)}
+    data = document.edit(data, path, value)
+    owner, field = (data["vehicle"], path[len("vehicle.") :]) if path.startswith("vehicle.") else (data, path)
+    if not path.startswith(("name", "sources", "vehicle.name", "vehicle.sources")):
+        owner["sources"] = {**owner.get("sources", {}), field: "set by the user"}
+    return data

@@ -1,0 +1,131 @@
+"""Termination conditions: each says how far the state is from ending the episode (paper R14).
+
+A condition returns a margin, the share of its bound that is left: positive inside, zero at the bound, negative beyond.
+Training, barriers, evaluation and plots all read the same margins.
+
+To add a condition: write a class with a `kind`, a bound and `margin(situation)`, and name it in `Termination`.
+"""
+
+import math
+from typing import Annotated, Literal
+
+import jax.numpy as jnp
+from annotated_types import Gt, Le, Unit
+from jaxtyping import Array, Float, Int
+from pydantic import Field
+
+from flytune.document import Real
+from flytune.physics import rotation
+from flytune.pytree import pytree, static
+from flytune.task.situation import Situation
+
+SAFE = -1  # cause of an episode that goes on
+
+
+@pytree
+class MinimumAltitude:
+    """Ends an episode that sinks below `bound`. Source: paper R14, 0.1 m."""
+
+    kind: Literal["minimum_altitude"] = static(default="minimum_altitude")
+    bound: Annotated[Real, Gt(0), Unit("m")]
+
+    def margin(self, situation: Situation) -> Float[Array, ""]:
+        """(z - bound) / bound: zero at the bound, one at twice its height."""
+        return situation.altitude / self.bound - 1
+
+
+@pytree
+class MaximumDistance:
+    """Ends an episode that strays from its target (H11). Source: paper R14, 3.0 m."""
+
+    kind: Literal["maximum_distance"] = static(default="maximum_distance")
+    bound: Annotated[Real, Gt(0), Unit("m")]
+
+    def margin(self, situation: Situation) -> Float[Array, ""]:
+        """Share of the bound that is left: 1 at the target."""
+        return 1 - rotation.safe_norm(situation.position_error) / self.bound
+
+
+@pytree
+class MaximumAttitudeError:
+    """Ends an episode whose geodesic attitude error is too large (H11).
+
+    Source: paper R14, pi: never true of an angle in [0, pi], and kept because it is printed (C9).
+    """
+
+    kind: Literal["maximum_attitude_error"] = static(default="maximum_attitude_error")
+    bound: Annotated[Real, Gt(0), Le(math.pi), Unit("rad")]
+
+    def margin(self, situation: Situation) -> Float[Array, ""]:
+        """Share of the bound that is left: 1 at the target's attitude."""
+        return 1 - rotation.angle(situation.attitude_error) / self.bound
+
+
+@pytree
+class MaximumTilt:
+    """Ends an episode that rolls or pitches too far, in place of the geodesic bound (H10). Source: paper R14, 15 deg."""
+
+    kind: Literal["maximum_tilt"] = static(default="maximum_tilt")
+    bound_deg: Annotated[Real, Gt(0), Le(180), Unit("deg")]
+
+    def margin(self, situation: Situation) -> Float[Array, ""]:
+        """Share of the bound that the larger of |roll| and |pitch| leaves."""
+        return 1 - jnp.max(jnp.abs(situation.roll_pitch)) / (self.bound_deg * math.pi / 180)
+
+
+@pytree
+class MaximumSpeed:
+    """Ends an episode that flies too fast; the strongest knob on settling time (H7).
+
+    Source: paper R14: 0.8 m/s baseline, 1.0 acrobatic, 0.2 inspection.
+    """
+
+    kind: Literal["maximum_speed"] = static(default="maximum_speed")
+    bound: Annotated[Real, Gt(0), Unit("m/s")]
+
+    def margin(self, situation: Situation) -> Float[Array, ""]:
+        """Share of the bound that is left: 1 at rest."""
+        return 1 - rotation.safe_norm(situation.velocity) / self.bound
+
+
+@pytree
+class MaximumBodyRate:
+    """Ends an episode that turns too fast (H8, H9). Reading: the norm of the rate, in deg/s.
+
+    Source: paper R14: 530 deg/s baseline and acrobatic, 115 inspection.
+    """
+
+    kind: Literal["maximum_body_rate"] = static(default="maximum_body_rate")
+    bound_deg_per_s: Annotated[Real, Gt(0), Unit("deg/s")]
+
+    def margin(self, situation: Situation) -> Float[Array, ""]:
+        """Share of the bound that is left: 1 where nothing turns."""
+        return 1 - rotation.safe_norm(situation.body_rate) / (self.bound_deg_per_s * math.pi / 180)
+
+
+Termination = Annotated[
+    MinimumAltitude | MaximumDistance | MaximumAttitudeError | MaximumTilt | MaximumSpeed | MaximumBodyRate,
+    Field(discriminator="kind"),
+]
+
+
+def margins(terminations: dict[str, Termination], situation: Situation) -> dict[str, Float[Array, ""]]:
+    """The margin of each condition by its name."""
+    return {name: condition.margin(situation) for name, condition in terminations.items()}
+
+
+def causes(terminations: dict[str, Termination]) -> list[str]:
+    """What each cause code stands for: the conditions in alphabetical order, then divergence."""
+    return [*sorted(terminations), "diverged"]
+
+
+def cause(margins: dict[str, Float[Array, ""]]) -> Int[Array, ""]:
+    """Why the episode ends now, as an index into `causes`, or SAFE: the condition with the smallest negative margin.
+
+    Margins that are not finite mean that the state is not: the code then says "diverged".
+    """
+    values = jnp.stack([margins[name] for name in sorted(margins)]) if margins else jnp.zeros(0)
+    if not margins:
+        return jnp.asarray(SAFE)
+    broken = jnp.where(jnp.min(values) < 0, jnp.argmin(values), SAFE)
+    return jnp.where(jnp.all(jnp.isfinite(values)), broken, len(margins))
