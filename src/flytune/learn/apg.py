@@ -17,7 +17,7 @@ from flytune import env
 from flytune.control.policy import Network, Policy, make_network
 from flytune.env import Episode
 from flytune.pytree import pytree
-from flytune.task.observation import SIZE, draw_noise
+from flytune.task.observation import NOISY, SIZE
 from flytune.task.task import Task
 from flytune.task.termination import causes
 from flytune.task.training import ApgSettings
@@ -58,7 +58,8 @@ def start(task: Task, settings: ApgSettings, key: Array) -> Learner:
     """A learner before its first update."""
     actor_key, episode_key, key = jax.random.split(key, 3)
     actor = make_network(actor_key, (SIZE, *settings.hidden, 4), last_gain=0.01)
-    episodes = jax.vmap(partial(env.reset, task))(jax.random.split(episode_key, settings.environments))
+    keys = jax.random.split(episode_key, settings.environments)
+    episodes = jax.vmap(partial(env.reset, task), out_axes=-1)(keys)
     return Learner(
         actor=actor,
         average=actor,
@@ -99,20 +100,25 @@ def update(task: Task, settings: ApgSettings, learner: Learner) -> tuple[Learner
 
 
 def _loss(task: Task, settings: ApgSettings, actor: Network, episodes: Episode, key: Array) -> Any:
-    """Mean cost per step of the whole batch, and the episodes it ends with."""
+    """Mean cost per step of the whole batch, and the episodes it ends with.
 
-    def one(episode: Episode, key: Array) -> Any:
-        def advance(episode: Episode, key: Array) -> Any:
-            noise_key, reset_key = jax.random.split(key)
-            seen = env.look(task, episode, draw_noise(noise_key))
-            moved, outcome = env.step(task, episode, jnp.tanh(actor(seen)))
-            cost = sum((barrier(margin, settings) for margin in outcome.margins.values()), start=jnp.zeros(()))
-            return env.autoreset(task, moved, outcome, reset_key), (outcome.reward - cost, outcome, moved.steps)
+    The batch is the last axis: arithmetic on scalars per vehicle then runs along contiguous memory. Only the episodes
+    between steps are kept for the gradient; what happens within a step is worked out again on the way back.
+    """
 
-        return jax.lax.scan(advance, episode, jax.random.split(key, settings.window))
+    def one_step(episode: Episode, normal: Array, reset_key: Array) -> Any:
+        action = jnp.tanh(actor(env.look(task, episode, normal)))
+        moved, outcome = env.step(task, episode, action)
+        cost = sum((barrier(margin, settings) for margin in outcome.margins.values()), start=jnp.zeros(()))
+        return env.autoreset(task, moved, outcome, reset_key), (outcome.reward - cost, outcome, moved.steps)
 
-    keys = jax.random.split(key, settings.environments)
-    episodes, (worth, outcome, steps) = jax.vmap(one)(episodes, keys)
+    batch_step = jax.checkpoint(jax.vmap(one_step, in_axes=-1, out_axes=-1), prevent_cse=False)
+    noise_key, reset_key = jax.random.split(key)
+    normal = jax.random.normal(noise_key, (settings.window, NOISY, settings.environments))
+    reset_keys = jax.random.split(reset_key, (settings.window, settings.environments))
+    episodes, (worth, outcome, steps) = jax.lax.scan(
+        lambda carry, now: batch_step(carry, *now), episodes, (normal, reset_keys)
+    )
     ended = outcome.terminated | outcome.truncated
     number = len(causes(task.termination))
     seen = {

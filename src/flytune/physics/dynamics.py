@@ -1,43 +1,45 @@
 """The equations of motion of one quadrotor and the step that integrates them (paper R1 to R6, R9)."""
 
-import jax
+from typing import Any
+
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from flytune.physics import rotation
+from flytune.physics.components import Components, add, cross, scale, unpack
 from flytune.physics.vehicle import Vehicle
 from flytune.pytree import pytree
 
 CONTROL_PERIOD = 0.01  # s (paper R6)
-PHYSICS_STEPS = 2  # per control period: 200 Hz (reading of R6; docs/integrator.md shows that finer buys nothing)
+PHYSICS_STEPS = 1  # per control period, forces and attitude also at its middle; docs/integrator.md shows that finer buys nothing
 
 
 @pytree
 class State:
-    """Everything that moves, of one vehicle."""
+    """Everything that moves, of one vehicle; vectors as tuples of scalars, see `components`."""
 
-    position: Float[Array, "3"]  # m, inertial frame, z up
-    attitude: Float[Array, "4"]  # unit quaternion (x, y, z, w), body to inertial
-    velocity: Float[Array, "3"]  # m/s, inertial frame
-    body_rate: Float[Array, "3"]  # rad/s, body frame
-    rotor_speed_rpm: Float[Array, "4"]  # rpm
+    position: Components  # 3, m, inertial frame, z up
+    attitude: Components  # 4, unit quaternion (x, y, z, w), body to inertial
+    velocity: Components  # 3, m/s, inertial frame
+    body_rate: Components  # 3, rad/s, body frame
+    rotor_speed_rpm: Components  # 4, rpm
     pending_actions: Float[Array, "latency 4"]  # actions on their way to the motors, oldest first
 
 
-def hovering(vehicle: Vehicle, position: Float[Array, "3"], attitude: Float[Array, "4"]) -> State:
+def hovering(vehicle: Vehicle, position: Components, attitude: Components = (0.0, 0.0, 0.0, 1.0)) -> State:
     """The vehicle at rest with its rotors at hover speed."""
     return State(
-        position=position,
-        attitude=attitude,
-        velocity=jnp.zeros(3),
-        body_rate=jnp.zeros(3),
-        rotor_speed_rpm=jnp.full(4, vehicle.hover_rotor_speed_rpm),
+        position=tuple(jnp.asarray(part, float) for part in position),
+        attitude=tuple(jnp.asarray(part, float) for part in attitude),
+        velocity=tuple(jnp.zeros(3)),
+        body_rate=tuple(jnp.zeros(3)),
+        rotor_speed_rpm=tuple(jnp.full(4, vehicle.hover_rotor_speed_rpm)),
         pending_actions=jnp.zeros((vehicle.action_latency_steps, 4)),
     )
 
 
-def commanded_rotor_speed(vehicle: Vehicle, action: Float[Array, "4"]) -> Float[Array, "4"]:
-    """The rotor speed in rpm an action asks for: hover speed * (1 + action_scale * action), within the motors' limit.
+def commanded_rotor_speed(vehicle: Vehicle, action: Any) -> Any:
+    """The rotor speed in rpm an action, of one motor or an array of them, asks for: hover speed * (1 + action_scale * action), within the motors' limit.
 
     The action is clipped to [-1, 1].
 
@@ -47,10 +49,8 @@ def commanded_rotor_speed(vehicle: Vehicle, action: Float[Array, "4"]) -> Float[
     return jnp.minimum(wanted, vehicle.maximum_rotor_speed_rpm)
 
 
-def thrust_and_torque(
-    vehicle: Vehicle, rotor_speed_rpm: Float[Array, "4"]
-) -> tuple[Float[Array, ""], Float[Array, "3"]]:
-    """Thrust along the body's z axis in N, and torque in the body frame in N m.
+def thrust_and_torque(vehicle: Vehicle, rotor_speed_rpm: Components) -> tuple[Any, Components]:
+    """Thrust along the body's z axis in N, and torque in the body frame in N m, of four rotor speeds in rpm.
 
         f_i = kf rpm_i^2
         tau_x = l (-f0 - f1 + f2 + f3)
@@ -59,45 +59,24 @@ def thrust_and_torque(
 
     Source: paper R4.
     """
-    s0, s1, s2, s3 = rotor_speed_rpm**2
+    s0, s1, s2, s3 = (speed * speed for speed in rotor_speed_rpm)
     bending = vehicle.thrust_coefficient * vehicle.lever
-    torque = jnp.stack(
-        [
-            bending * (-s0 - s1 + s2 + s3),
-            bending * (-s0 + s1 + s2 - s3),
-            vehicle.torque_coefficient * (-s0 + s1 - s2 + s3),
-        ]
+    torque = (
+        bending * (-s0 - s1 + s2 + s3),
+        bending * (-s0 + s1 + s2 - s3),
+        vehicle.torque_coefficient * (-s0 + s1 - s2 + s3),
     )
     return vehicle.thrust_coefficient * (s0 + s1 + s2 + s3), torque
 
 
-def derivative(vehicle: Vehicle, state: State, rotor_speed_rpm: Float[Array, "4"]) -> State:
-    """The time derivative of the rigid body, for given rotor speeds in rpm; its rotor and action fields are zero.
-
-        p'' = R(q) [0, 0, T] / m - [0, 0, g] - D p' / m
-        q'  = 1/2 q (x) [w, 0]
-        w'  = I^-1 (tau - w x I w)
-
-    Source: paper R1, R2, R3.
-    """
-    thrust, torque = thrust_and_torque(vehicle, rotor_speed_rpm)
-    inertia = jnp.stack(vehicle.inertia)
-    drag = jnp.stack(vehicle.drag) * state.velocity
-    weight = jnp.array([0.0, 0.0, 1.0]) * vehicle.gravity
-    spin = jnp.append(state.body_rate, 0.0)
-    return State(
-        position=state.velocity,
-        attitude=0.5 * rotation.multiply(state.attitude, spin),
-        velocity=(thrust * rotation.vertical_axis(state.attitude) - drag) / vehicle.mass - weight,
-        body_rate=(torque - jnp.cross(state.body_rate, inertia * state.body_rate)) / inertia,
-        rotor_speed_rpm=jnp.zeros_like(state.rotor_speed_rpm),
-        pending_actions=jnp.zeros_like(state.pending_actions),
-    )
+def angular_acceleration(vehicle: Vehicle, body_rate: Components, torque: Components) -> Components:
+    """w' = I^-1 (tau - w x I w) in rad/s^2, body frame. Source: paper R3."""
+    momentum = tuple(i * w for i, w in zip(vehicle.inertia, body_rate, strict=True))
+    gyroscopic = cross(body_rate, momentum)
+    return tuple((t - g) / i for t, g, i in zip(torque, gyroscopic, vehicle.inertia, strict=True))
 
 
-def rotor_speed_after(
-    vehicle: Vehicle, now: Float[Array, "4"], commanded: Float[Array, "4"], elapsed: float
-) -> Float[Array, "4"]:
+def rotor_speed_after(vehicle: Vehicle, now: Components, commanded: Components, elapsed: float) -> Components:
     """Rotor speeds in rpm after `elapsed` seconds of a constant command: the exact first-order response.
 
         rpm(t) = command + (rpm(0) - command) exp(-t / tau),  tau by whether the rotor speeds up or slows down
@@ -111,44 +90,80 @@ def rotor_speed_after(
 
     rising = share_left(vehicle.motor_rise_time_constant)
     falling = share_left(vehicle.motor_fall_time_constant)
-    return commanded + (now - commanded) * jnp.where(commanded > now, rising, falling)
+    return tuple(
+        goal + (speed - goal) * jnp.where(goal > speed, rising, falling)
+        for speed, goal in zip(now, commanded, strict=True)
+    )
 
 
 def step(vehicle: Vehicle, state: State, action: Float[Array, "4"], physics_steps: int = PHYSICS_STEPS) -> State:
     """The state one control period (0.01 s) later, under one action in [-1, 1]^4.
 
-    The action waits out the latency, moves the motors, and the motors move the body: classical Runge-Kutta of fourth
-    order on the rigid body, the rotor speeds inserted in closed form, the quaternion normalised after every step.
+    The action waits out the latency, moves the motors, and the motors move the body.
     """
     queue = jnp.concatenate([state.pending_actions, action[None]])
-    commanded = commanded_rotor_speed(vehicle, queue[0])
-    state = State(**{**vars(state), "pending_actions": queue[1:]})
-    duration = CONTROL_PERIOD / physics_steps
-
-    def physics_step(state: State, _: None) -> tuple[State, None]:
-        return _runge_kutta(vehicle, state, commanded, duration), None
-
-    return jax.lax.scan(physics_step, state, length=physics_steps, unroll=1)[0]
-
-
-def _runge_kutta(vehicle: Vehicle, state: State, commanded: Float[Array, "4"], duration: float) -> State:
-    half = duration / 2
-    speeds = [rotor_speed_after(vehicle, state.rotor_speed_rpm, commanded, t) for t in (0.0, half, duration)]
-
-    def ahead(slope: State, time: float) -> State:
-        return jax.tree.map(lambda value, rate: value + time * rate, state, slope)
-
-    k1 = derivative(vehicle, state, speeds[0])
-    k2 = derivative(vehicle, ahead(k1, half), speeds[1])
-    k3 = derivative(vehicle, ahead(k2, half), speeds[1])
-    k4 = derivative(vehicle, ahead(k3, duration), speeds[2])
-    mean = jax.tree.map(lambda a, b, c, d: (a + 2 * b + 2 * c + d) / 6, k1, k2, k3, k4)
-    end = ahead(mean, duration)
+    commanded = tuple(commanded_rotor_speed(vehicle, motor) for motor in unpack(queue[0]))
+    body = (state.position, state.attitude, state.velocity, state.body_rate)
+    rotors, duration = state.rotor_speed_rpm, CONTROL_PERIOD / physics_steps
+    for _ in range(physics_steps):
+        speeds = [rotor_speed_after(vehicle, rotors, commanded, t) for t in (0.0, duration / 2, duration)]
+        body, rotors = _physics_step(vehicle, body, speeds, duration), speeds[-1]
+    position, attitude, velocity, body_rate = body
     return State(
-        position=end.position,
-        attitude=rotation.normalise(end.attitude),
-        velocity=end.velocity,
-        body_rate=end.body_rate,
-        rotor_speed_rpm=speeds[2],
-        pending_actions=state.pending_actions,
+        position=position,
+        attitude=attitude,
+        velocity=velocity,
+        body_rate=body_rate,
+        rotor_speed_rpm=rotors,
+        pending_actions=queue[1:],
     )
+
+
+def _physics_step(
+    vehicle: Vehicle, body: tuple[Components, ...], rotor_speeds: list[Components], h: float
+) -> tuple[Components, ...]:
+    """Position, attitude, velocity and body rate after h seconds, of fourth order.
+
+    `rotor_speeds` holds the rotor speeds at the start, the middle and the end of the step. The equations form a chain,
+    torque -> body rate -> attitude -> thrust direction -> velocity -> position, and each link is solved with what the
+    link before it gives at these three instants: body rate by classical Runge-Kutta, attitude by the exponential of
+    the fourth-order Magnus expansion (Iserles et al., Acta Numerica 2000, section 5; the sign is that of right
+    multiplication), velocity and position by Simpson's rule and its once repeated form.
+    """
+    p, q, v, w = body
+    forces = [thrust_and_torque(vehicle, speed) for speed in rotor_speeds]
+    torques = [torque for _, torque in forces]
+
+    def turn(rate: Components, instant: int) -> Components:
+        return angular_acceleration(vehicle, rate, torques[instant])
+
+    k1 = turn(w, 0)
+    k2 = turn(add(w, scale(h / 2, k1)), 1)
+    k3 = turn(add(w, scale(h / 2, k2)), 1)
+    k4 = turn(add(w, scale(h, k3)), 2)
+    w_end = add(w, scale(h / 6, add(k1, scale(2, k2), scale(2, k3), k4)))
+    # the cubic through both ends and their slopes, at the middle
+    w_middle = add(scale(0.5, add(w, w_end)), scale(h / 8, add(k1, scale(-1, turn(w_end, 2)))))
+
+    whole = add(scale(h / 6, add(w, scale(4, w_middle), w_end)), scale(h**2 / 12, cross(w, w_end)))
+    first_half = add(
+        scale(h / 24, add(scale(5, w), scale(8, w_middle), scale(-1, w_end))), scale(h**2 / 48, cross(w, w_middle))
+    )
+    q_end = rotation.normalise(rotation.multiply(q, rotation.exponential(whole)))
+    q_middle = rotation.multiply(q, rotation.exponential(first_half))
+
+    weight = (0.0, 0.0, -vehicle.gravity)
+    a0, a1, a2 = (
+        add(scale(thrust / vehicle.mass, rotation.vertical_axis(attitude)), weight)
+        for (thrust, _), attitude in zip(forces, (q, q_middle, q_end), strict=True)
+    )
+    drag = tuple(coefficient / vehicle.mass for coefficient in vehicle.drag)
+    undragged = add(scale(h, v), scale(h**2 / 6, add(a0, scale(2, a1))))
+    slowed = add(scale(h**2 / 2, v), scale(h**3 / 6, add(a0, tuple(-d * c for d, c in zip(drag, v, strict=True)))))
+    moved = tuple(u - d * s for u, d, s in zip(undragged, drag, slowed, strict=True))
+    v_end = add(
+        v,
+        scale(h / 6, add(a0, scale(4, a1), a2)),
+        tuple(-d * m for d, m in zip(drag, moved, strict=True)),  # drag is linear: its integral is -D times the way
+    )
+    return add(p, moved), q_end, v_end, w_end

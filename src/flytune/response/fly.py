@@ -11,10 +11,11 @@ from flytune.control.controller import Controller
 from flytune.errors import BadInput, Diverged
 from flytune.physics import dynamics
 from flytune.physics.dynamics import CONTROL_PERIOD, State
+from flytune.physics.rotation import safe_norm
 from flytune.response.flights import Flights
 from flytune.task.initial_state import EVALUATION_STARTS, InitialState
 from flytune.task.observation import draw_noise, observe
-from flytune.task.situation import situation
+from flytune.task.situation import position_error, situation
 from flytune.task.task import Task
 from flytune.task.termination import margins
 
@@ -71,11 +72,11 @@ def fly(
         )
     return Flights(
         time=np.arange(steps + 1) * CONTROL_PERIOD,
-        position=states.position,
-        attitude=states.attitude,
-        velocity=states.velocity,
-        body_rate=states.body_rate,
-        rotor_speed_rpm=states.rotor_speed_rpm,
+        position=np.stack(states.position, axis=-1),
+        attitude=np.stack(states.attitude, axis=-1),
+        velocity=np.stack(states.velocity, axis=-1),
+        body_rate=np.stack(states.body_rate, axis=-1),
+        rotor_speed_rpm=np.stack(states.rotor_speed_rpm, axis=-1),
         action=actions,
         crashed=crashed,
         margins=left,
@@ -124,6 +125,6 @@ def _fly_one(controller: Any, task: Task, starts: InitialState, key: jax.Array, 
 
 
 def _is_lost(task: Task, state: State) -> jax.Array:
-    distance = jnp.linalg.norm(state.position - jnp.stack(task.target.position))
-    body = jnp.concatenate([state.attitude, state.velocity, state.body_rate])
+    distance = safe_norm(position_error(task.target, state.position))
+    body = jnp.stack([*state.attitude, *state.velocity, *state.body_rate])
     return ~((distance <= BALL) & jnp.all(jnp.isfinite(body)))

@@ -4,7 +4,6 @@ import math
 from typing import Annotated
 
 import jax
-import jax.numpy as jnp
 from annotated_types import Ge, Le, Unit
 
 from flytune.document import Real
@@ -35,10 +34,11 @@ class InitialState:
     def draw(self, vehicle: Vehicle, key: jax.Array) -> State:
         """One state of the distribution."""
         unit = jax.random.uniform(key, (6,))
-        low, high = jnp.stack(self.lowest_position), jnp.stack(self.highest_position)
-        tilt = self.largest_tilt * (2 * unit[3:5] - 1)
+        box = zip(self.lowest_position, self.highest_position, unit[:3], strict=True)
+        position = tuple(low + (high - low) * share for low, high, share in box)
+        roll, pitch = (self.largest_tilt * (2 * share - 1) for share in unit[3:5])
         yaw = self.largest_yaw * (2 * unit[5] - 1)
-        return hovering(vehicle, low + (high - low) * unit[:3], rotation.from_euler(tilt[0], tilt[1], yaw))
+        return hovering(vehicle, position, rotation.from_euler(roll, pitch, yaw))
 
 
 EVALUATION_STARTS = {

@@ -9,9 +9,10 @@ from jaxtyping import Array, Float
 
 from flytune.document import Real
 from flytune.physics import rotation
+from flytune.physics.components import add, pack, scale, unpack
 from flytune.physics.dynamics import State
 from flytune.pytree import pytree
-from flytune.task.situation import Target, attitude_error
+from flytune.task.situation import Target, attitude_error, position_error
 
 SIZE = 17
 NOISY = 13  # the first 13 carry noise; the last action does not
@@ -49,16 +50,12 @@ def observe(
 
     Source: paper R7, R8. Reading: the quaternion is flipped, then noise is added, then it is normalised.
     """
-    e, q, v, w = jnp.split(normal, (3, 7, 10))
-    return jnp.concatenate(
-        [
-            state.position - jnp.stack(target.position) + noise.position * e,
-            rotation.normalise(attitude_error(target, state.attitude) + noise.attitude * q),
-            state.velocity + noise.velocity * v,
-            state.body_rate + noise.body_rate * w,
-            last_action,
-        ]
-    )
+    numbers = unpack(normal)
+    position = add(position_error(target, state.position), scale(noise.position, numbers[:3]))
+    attitude = rotation.normalise(add(attitude_error(target, state.attitude), scale(noise.attitude, numbers[3:7])))
+    velocity = add(state.velocity, scale(noise.velocity, numbers[7:10]))
+    body_rate = add(state.body_rate, scale(noise.body_rate, numbers[10:]))
+    return pack((*position, *attitude, *velocity, *body_rate, *unpack(last_action)))
 
 
 def draw_noise(key: jax.Array) -> Float[Array, "13"]:

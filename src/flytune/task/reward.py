@@ -12,6 +12,7 @@ from pydantic import Field
 
 from flytune.document import Real
 from flytune.physics import rotation
+from flytune.physics.components import squared_norm
 from flytune.pytree import pytree, static
 from flytune.task.situation import Situation
 
@@ -25,17 +26,17 @@ def squared_error(situation: Situation, of: Error) -> Float[Array, ""]:
     """
     match of:
         case "horizontal":
-            return jnp.sum(situation.position_error[:2] ** 2)
+            return squared_norm(situation.position_error[:2])
         case "vertical":
             return situation.position_error[2] ** 2
         case "position":
-            return jnp.sum(situation.position_error**2)
+            return squared_norm(situation.position_error)
         case "velocity":
-            return jnp.sum(situation.velocity**2)
+            return squared_norm(situation.velocity)
         case "attitude":
             return rotation.angle(situation.attitude_error) ** 2
         case "body_rate":
-            return jnp.sum(situation.body_rate**2)
+            return squared_norm(situation.body_rate)
 
 
 @pytree
@@ -116,7 +117,7 @@ class Smoothness:
 
     def __call__(self, situation: Situation) -> Float[Array, ""]:
         """Reward of one situation, at most zero."""
-        return -self.weight * jnp.sum(situation.action_change**2)
+        return -self.weight * squared_norm(situation.action_change)
 
 
 RewardTerm = Annotated[Survival | Exponential | DualExponential | Smoothness, Field(discriminator="kind")]

@@ -8,6 +8,7 @@ from jaxtyping import Array, Float
 
 from flytune.document import Real
 from flytune.physics import rotation
+from flytune.physics.components import Components, unpack
 from flytune.physics.dynamics import State
 from flytune.pytree import pytree
 
@@ -22,32 +23,41 @@ class Target:
 
 @pytree
 class Situation:
-    """One vehicle, seen from its target."""
+    """One vehicle, seen from its target; vectors as tuples of scalars."""
 
-    position_error: Float[Array, "3"]  # m, p - p*
-    attitude_error: Float[Array, "4"]  # conj(q*) (x) q, real part not negative
-    velocity: Float[Array, "3"]  # m/s, inertial frame
-    body_rate: Float[Array, "3"]  # rad/s, body frame
+    position_error: Components  # 3, m, p - p*
+    attitude_error: Components  # 4, conj(q*) (x) q, real part not negative
+    velocity: Components  # 3, m/s, inertial frame
+    body_rate: Components  # 3, rad/s, body frame
     altitude: Float[Array, ""]  # m, z
-    roll_pitch: Float[Array, "2"]  # rad
-    action_change: Float[Array, "4"]  # a_t - a_{t-1}
+    roll: Float[Array, ""]  # rad
+    pitch: Float[Array, ""]  # rad
+    action_change: Components  # 4, a_t - a_{t-1}
 
 
-def attitude_error(target: Target, attitude: Float[Array, "4"]) -> Float[Array, "4"]:
+def position_error(target: Target, position: Components) -> Components:
+    """The way from the target to the vehicle in metres, e_p = p - p* (reading of R7)."""
+    return tuple(here - wanted for here, wanted in zip(position, target.position, strict=True))
+
+
+def attitude_error(target: Target, attitude: Components) -> Components:
     """The rotation from the target's attitude to the vehicle's, conj(q*) (x) q, flipped to w >= 0 (reading of R7)."""
+    half = jnp.asarray(target.yaw) / 2
     zero = jnp.zeros(())
-    wanted = rotation.from_euler(zero, zero, jnp.asarray(target.yaw))
+    wanted = (zero, zero, jnp.sin(half), jnp.cos(half))
     return rotation.shortest(rotation.multiply(rotation.conjugate(wanted), attitude))
 
 
 def situation(target: Target, state: State, action_change: Float[Array, "4"]) -> Situation:
     """The situation of a true state, after an action that differed from the one before by `action_change`."""
+    roll, pitch = rotation.roll_pitch(state.attitude)
     return Situation(
-        position_error=state.position - jnp.stack(target.position),
+        position_error=position_error(target, state.position),
         attitude_error=attitude_error(target, state.attitude),
         velocity=state.velocity,
         body_rate=state.body_rate,
         altitude=state.position[2],
-        roll_pitch=rotation.roll_pitch_yaw(state.attitude)[:2],
-        action_change=action_change,
+        roll=roll,
+        pitch=pitch,
+        action_change=unpack(action_change),
     )

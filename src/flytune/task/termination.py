@@ -70,7 +70,7 @@ class MaximumTilt:
 
     def margin(self, situation: Situation) -> Float[Array, ""]:
         """Share of the bound that the larger of |roll| and |pitch| leaves."""
-        return 1 - jnp.max(jnp.abs(situation.roll_pitch)) / (self.bound_deg * math.pi / 180)
+        return 1 - jnp.maximum(jnp.abs(situation.roll), jnp.abs(situation.pitch)) / (self.bound_deg * math.pi / 180)
 
 
 @pytree

@@ -1,0 +1,1 @@
+"""Showing: judged flights become figures and one page to read."""

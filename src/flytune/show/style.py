@@ -1,0 +1,54 @@
+"""Colours and the frame of every figure: thin lines, few colours, safe for colour-blind eyes and for paper."""
+
+from collections.abc import Sequence
+from html import escape
+from typing import Any
+
+import plotly.graph_objects as go
+
+INK, QUIET, HAIRLINE = "#1f2933", "#7b8794", "#e4e7eb"
+BOUND, BAND, OTHERS = "#b3261e", "rgba(46, 125, 50, 0.16)", "rgba(123, 135, 148, 0.35)"
+TRIALS = ("#0b5fa5", "#d1690e", "#12805c", "#8e4585", "#a58a00")  # after Okabe and Ito, darkened for thin lines
+AXES = {"x": "#0b5fa5", "y": "#12805c", "z": "#8e4585", "yaw": "#d1690e"}
+MANY = (*TRIALS, "#4aa3c7", "#6b7280", "#c2567a", "#5b7a1e", "#3f3d99")  # reward terms, causes, policies
+FONT = "system-ui, -apple-system, 'Segoe UI', Roboto, 'Helvetica Neue', Arial, sans-serif"
+
+
+def colour(index: int) -> str:
+    """The colour of the term, cause or policy with this number; they repeat after ten."""
+    return MANY[index % len(MANY)]
+
+
+def label(name: str, longest: int = 40) -> str:
+    """A name somebody typed, as a text of a figure: cut if long, and escaped, since plotly reads a subset of HTML."""
+    return escape(name if len(name) <= longest else name[: longest - 1] + "…")
+
+
+def frame(figure: go.Figure, height: int, **layout: Any) -> go.Figure:
+    """The figure in the house style, `height` pixels high; its width is that of the page."""
+    figure.update_layout(
+        height=height,
+        template="none",
+        font={"family": FONT, "size": 12.5, "color": INK},
+        paper_bgcolor="white",
+        plot_bgcolor="white",
+        margin={"l": 66, "r": 14, "t": 64, "b": 48},
+        legend={"orientation": "h", "x": 0, "xanchor": "left", "y": 1, "yref": "container", "yanchor": "top"},
+        hoverlabel={"font": {"family": FONT, "size": 12}},
+    )
+    figure.update_layout(**layout)
+    line = {"showline": True, "linecolor": QUIET, "linewidth": 1, "ticks": "outside", "ticklen": 4, "tickcolor": QUIET}
+    for update in (figure.update_xaxes, figure.update_yaxes):
+        update(gridcolor=HAIRLINE, zeroline=False, title_font_size=12.5, title_standoff=8, **line)
+    figure.update_annotations(font={"size": 12.5, "color": INK})
+    return figure
+
+
+def heading(text: str) -> str:
+    """The title of a panel."""
+    return f"<b>{text}</b>"
+
+
+def listed(words: Sequence[str]) -> str:
+    """Words as a sentence lists them: a, b and c."""
+    return " and ".join([", ".join(words[:-1]), words[-1]] if len(words) > 1 else words)
