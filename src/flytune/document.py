@@ -35,13 +35,24 @@ def load(path: Path) -> dict[str, Any]:
         BadInput: the file is missing, unreadable or not TOML.
     """
     try:
-        return tomllib.loads(path.read_text(encoding="utf-8"))
+        text = path.read_text(encoding="utf-8")
     except OSError as error:
         raise BadInput(f"{path}: cannot be read ({error.strerror}). Give a TOML file or a preset's name.") from None
     except UnicodeDecodeError:
         raise BadInput(f"{path}: is not text. Give a TOML file in UTF-8.") from None
+    return parse(text, str(path))
+
+
+def parse(text: str, where: str) -> dict[str, Any]:
+    """The tables of a TOML text.
+
+    Raises:
+        BadInput: it is not TOML.
+    """
+    try:
+        return tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
-        raise BadInput(f"{path}: is not valid TOML: {error}.") from None
+        raise BadInput(f"{where}: is not valid TOML: {error}.") from None
 
 
 def read(kind: type[T], data: Mapping[str, Any], where: str = "") -> T:
@@ -227,6 +238,10 @@ def _variant(union: Any, data: Any) -> Any:
     return classes[0] if classes else None
 
 
+def _item(node: Any, name: Any) -> Any:
+    return node[name]
+
+
 def _explain(kind: Any, data: Any, error: ValidationError) -> str:
     """One line for the first thing that is wrong, unknown keys before what they may have been meant for."""
     problems = sorted(error.errors(), key=lambda problem: problem["type"] != "unexpected_keyword_argument")
@@ -243,7 +258,7 @@ def _explain(kind: Any, data: Any, error: ValidationError) -> str:
         if final and problem["type"] == "unexpected_keyword_argument":
             return _unknown_key(annotation, node, path, str(name))
         annotation = _step(annotation, name, node)
-        node = node[name] if is_key or is_index else None
+        node = _item(node, name) if is_key or is_index else None
         path.append(str(name))
     where = ".".join(path)
     if problem["type"].startswith("union_tag"):

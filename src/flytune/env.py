@@ -21,6 +21,7 @@ class Episode:
     state: State
     last_action: Float[Array, "4"]  # the clipped action before; hover (0) after a reset
     steps: Int[Array, ""]  # control steps since the start
+    reward: Float[Array, ""]  # sum since the start
 
 
 @pytree
@@ -38,7 +39,10 @@ class Outcome:
 def reset(task: Task, key: jax.Array) -> Episode:
     """A new episode at a state drawn from the task's initial states."""
     return Episode(
-        state=task.initial_state.draw(task.vehicle, key), last_action=jnp.zeros(4), steps=jnp.zeros((), jnp.int32)
+        state=task.initial_state.draw(task.vehicle, key),
+        last_action=jnp.zeros(4),
+        steps=jnp.zeros((), jnp.int32),
+        reward=jnp.zeros(()),
     )
 
 
@@ -68,7 +72,7 @@ def step(task: Task, episode: Episode, action: Float[Array, "4"]) -> tuple[Episo
         terminated=terminated,
         truncated=(steps >= task.horizon) & ~terminated,
     )
-    return Episode(state=state, last_action=action, steps=steps), outcome
+    return Episode(state=state, last_action=action, steps=steps, reward=episode.reward + outcome.reward), outcome
 
 
 def autoreset(task: Task, episode: Episode, outcome: Outcome, key: jax.Array) -> Episode:

@@ -79,10 +79,14 @@ def curve():
 @pytest.fixture(scope="session")
 def make_entry(task, flights, curve):
     """Factory of entries from the real flights; arguments replace fields of the entry, or of the flights."""
-    fields = {field.name for field in dataclasses.fields(flights)}
+    fields = {field.name for field in dataclasses.fields(flights)} - {"task"}
 
     def make(**changes):
-        flown = dataclasses.replace(flights, **{key: value for key, value in changes.items() if key in fields})
+        flown = dataclasses.replace(
+            flights,
+            task=changes.get("task", task).name,
+            **{key: value for key, value in changes.items() if key in fields},
+        )
         given = {
             "name": "untrained",
             "task": task,
@@ -91,7 +95,7 @@ def make_entry(task, flights, curve):
             "metrics": curve,
             "about": {"trainer": "none", "seed": "0"},
         }
-        return Entry(**(given | {key: value for key, value in changes.items() if key not in fields or key == "task"}))
+        return Entry(**(given | {key: value for key, value in changes.items() if key not in fields}))
 
     return make
 

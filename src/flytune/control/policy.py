@@ -1,5 +1,6 @@
 """The networks: an actor that flies and a critic that predicts reward, both 17-64-64 with tanh (paper R16)."""
 
+import itertools
 import json
 import struct
 from collections.abc import Sequence
@@ -41,7 +42,7 @@ def make_network(key: jax.Array, sizes: Sequence[int], last_gain: float) -> Netw
     """
     gains = [2**0.5] * (len(sizes) - 2) + [last_gain]
     keys = jax.random.split(key, len(gains))
-    shapes = list(zip(sizes[:-1], sizes[1:], strict=True))
+    shapes = list(itertools.pairwise(sizes))
     return Network(
         weights=tuple(
             jax.nn.initializers.orthogonal(gain)(k, shape) for k, gain, shape in zip(keys, gains, shapes, strict=True)

@@ -5,6 +5,7 @@ critic, with respect to the actor's weights. Episodes carry over from update to 
 as a barrier on their margins, a smooth function where their end of an episode has no gradient.
 """
 
+import dataclasses
 from functools import partial
 from typing import Any
 
@@ -16,10 +17,11 @@ from jaxtyping import Array, Float
 from flytune import env
 from flytune.control.policy import Network, Policy, make_network
 from flytune.env import Episode
+from flytune.learn.account import account
+from flytune.learn.optimise import averaged, descend
 from flytune.pytree import pytree
-from flytune.task.observation import NOISY, SIZE
+from flytune.task.observation import BLOCKS, NOISY, SIZE
 from flytune.task.task import Task
-from flytune.task.termination import causes
 from flytune.task.training import ApgSettings
 
 
@@ -35,14 +37,19 @@ class Learner:
     updates: Array
 
 
-def policy(learner: Learner) -> Policy:
+def policy(settings: ApgSettings, learner: Learner) -> Policy:
     """The policy that is flown: the averaged actor."""
-    return Policy(actor=learner.average, input_scale=jnp.ones(SIZE), squash="tanh")
+    return Policy(actor=learner.average, input_scale=input_scale(settings), squash="tanh")
 
 
-def last_policy(learner: Learner) -> Policy:
+def last_policy(settings: ApgSettings, learner: Learner) -> Policy:
     """The policy of the last update."""
-    return Policy(actor=learner.actor, input_scale=jnp.ones(SIZE), squash="tanh")
+    return Policy(actor=learner.actor, input_scale=input_scale(settings), squash="tanh")
+
+
+def input_scale(settings: ApgSettings) -> Float[Array, "17"]:
+    """What each number of the observation is multiplied with, from one factor per block."""
+    return jnp.repeat(jnp.asarray(settings.input_scale), jnp.asarray(BLOCKS), total_repeat_length=SIZE)
 
 
 def _optimiser(settings: ApgSettings) -> optax.GradientTransformation:
@@ -56,6 +63,7 @@ def _optimiser(settings: ApgSettings) -> optax.GradientTransformation:
 @partial(jax.jit, static_argnames="settings")
 def start(task: Task, settings: ApgSettings, key: Array) -> Learner:
     """A learner before its first update."""
+    task = dataclasses.replace(task, initial_state=settings.initial_state)
     actor_key, episode_key, key = jax.random.split(key, 3)
     actor = make_network(actor_key, (SIZE, *settings.hidden, 4), last_gain=0.01)
     keys = jax.random.split(episode_key, settings.environments)
@@ -63,7 +71,7 @@ def start(task: Task, settings: ApgSettings, key: Array) -> Learner:
     return Learner(
         actor=actor,
         average=actor,
-        optimiser=_optimiser(settings).init(actor),
+        optimiser=_optimiser(settings).init(actor),  # pyright: ignore[reportArgumentType]
         episodes=episodes,
         key=key,
         updates=jnp.zeros((), jnp.int32),
@@ -82,15 +90,11 @@ def update(task: Task, settings: ApgSettings, learner: Learner) -> tuple[Learner
     (_, (episodes, seen)), gradient = jax.value_and_grad(_loss, argnums=2, has_aux=True)(
         task, settings, learner.actor, learner.episodes, flight_key
     )
-    change, optimiser = _optimiser(settings).update(gradient, learner.optimiser, learner.actor)
-    actor: Network = optax.apply_updates(learner.actor, change)  # pyright: ignore[reportAssignmentType]
-    # the average starts as the mean of what there is, and forgets at its own rate only later
-    keep = jnp.minimum(settings.average, learner.updates / (learner.updates + 1.0))
-    average = jax.tree.map(lambda old, new: keep * old + (1 - keep) * new, learner.average, actor)
+    actor, optimiser = descend(_optimiser(settings), gradient, learner.optimiser, learner.actor)
     seen["gradient_norm"] = optax.global_norm(gradient)
     after = Learner(
         actor=actor,
-        average=average,
+        average=averaged(learner.average, actor, settings.average, learner.updates),
         optimiser=optimiser,
         episodes=episodes,
         key=key,
@@ -105,28 +109,20 @@ def _loss(task: Task, settings: ApgSettings, actor: Network, episodes: Episode, 
     The batch is the last axis: arithmetic on scalars per vehicle then runs along contiguous memory. Only the episodes
     between steps are kept for the gradient; what happens within a step is worked out again on the way back.
     """
+    task = dataclasses.replace(task, initial_state=settings.initial_state)
+    scale = input_scale(settings)
 
     def one_step(episode: Episode, normal: Array, reset_key: Array) -> Any:
-        action = jnp.tanh(actor(env.look(task, episode, normal)))
+        action = jnp.tanh(actor(env.look(task, episode, normal) * scale))
         moved, outcome = env.step(task, episode, action)
         cost = sum((barrier(margin, settings) for margin in outcome.margins.values()), start=jnp.zeros(()))
-        return env.autoreset(task, moved, outcome, reset_key), (outcome.reward - cost, outcome, moved.steps)
+        return env.autoreset(task, moved, outcome, reset_key), (outcome.reward - cost, outcome, moved)
 
     batch_step = jax.checkpoint(jax.vmap(one_step, in_axes=-1, out_axes=-1), prevent_cse=False)
     noise_key, reset_key = jax.random.split(key)
     normal = jax.random.normal(noise_key, (settings.window, NOISY, settings.environments))
     reset_keys = jax.random.split(reset_key, (settings.window, settings.environments))
-    episodes, (worth, outcome, steps) = jax.lax.scan(
+    episodes, (worth, outcome, moved) = jax.lax.scan(
         lambda carry, now: batch_step(carry, *now), episodes, (normal, reset_keys)
     )
-    ended = outcome.terminated | outcome.truncated
-    number = len(causes(task.termination))
-    seen = {
-        "objective": jnp.mean(worth),
-        "reward": jnp.mean(outcome.reward),
-        "terms": jax.tree.map(jnp.mean, outcome.terms),
-        "terminations": jnp.sum(jax.nn.one_hot(outcome.cause, number), axis=(0, 1)),
-        "episodes": jnp.sum(ended),
-        "episode_length": jnp.sum(jnp.where(ended, steps, 0)) / jnp.maximum(jnp.sum(ended), 1),
-    }
-    return -jnp.mean(worth), (episodes, seen)
+    return -jnp.mean(worth), (episodes, {**account(task, outcome, moved), "objective": jnp.mean(worth)})

@@ -11,7 +11,9 @@ from flytune.physics.vehicle import Vehicle
 from flytune.pytree import pytree
 
 CONTROL_PERIOD = 0.01  # s (paper R6)
-PHYSICS_STEPS = 1  # per control period, forces and attitude also at its middle; docs/integrator.md shows that finer buys nothing
+PHYSICS_STEPS = (
+    1  # per control period, forces and attitude also at its middle; docs/integrator.md shows that finer buys nothing
+)
 
 
 @pytree
@@ -39,7 +41,9 @@ def hovering(vehicle: Vehicle, position: Components, attitude: Components = (0.0
 
 
 def commanded_rotor_speed(vehicle: Vehicle, action: Any) -> Any:
-    """The rotor speed in rpm an action, of one motor or an array of them, asks for: hover speed * (1 + action_scale * action), within the motors' limit.
+    """The rotor speed in rpm that an action of one motor asks for, within the motor's limit.
+
+        rpm = hover speed * (1 + action_scale * action)
 
     The action is clipped to [-1, 1].
 

@@ -55,7 +55,7 @@ class Flights:
         return float(self.time[-1])
 
     def save(self, path: Path) -> None:
-        """Write the trajectories as .npz: `data` [N, T + 1, C] with `columns` [C] and `units` [C], and what they are."""
+        """Write the trajectories as .npz: `data` [N, T + 1, C] with `columns` [C], `units` [C] and labels."""
         blocks = [np.broadcast_to(self.time[None, :, None], (*self.position.shape[:2], 1))]
         columns, units = ["time"], ["s"]
         for field, names in STATE_COLUMNS.items():

@@ -1,7 +1,6 @@
 """The judge: Flights in, one Judgement out, the same whoever flew. NumPy only."""
 
 import dataclasses
-import math
 from collections.abc import Mapping
 
 import numpy as np
@@ -10,6 +9,7 @@ from jaxtyping import Bool, Float
 from flytune.response import bounds, metrics
 from flytune.response.flights import Flights
 from flytune.response.statistics import finite, median, summary
+from flytune.response.table import response_line, response_table
 
 AXES = ("x", "y", "z", "yaw")
 CHANNELS = (*AXES, "position")
@@ -119,16 +119,13 @@ class Judgement:
 
     def table(self) -> str:
         """The response table for a terminal: plain text, one row per channel, '-' where a quantile is infinite."""
-        judged = self.to_dict()
-        rows = [_row(axis, self.trials, judged["axes"][axis]) for axis in AXES]
-        rows.append(_row("position", self.trials, judged["position"]))
-        return "\n".join([self._heading(), "", *HEADER, *rows, "", *_footer(judged)])
+        return response_table(self.to_dict())
 
     __str__ = table
 
-    def _heading(self) -> str:
-        flown = f"{self.trials} trials of {self.duration:g} s, starts {self.starts}, seed {self.seed}"
-        return f"{self.who} on {self.task} ({self.vehicle}, world {self.world}): {flown}"
+    def line(self) -> str:
+        """The judgement in one line."""
+        return response_line(self.to_dict())
 
 
 def judge(flights: Flights) -> Judgement:
@@ -254,43 +251,3 @@ def _settling(settling_time: PerTrial) -> dict:
 
 def _count(flags: PerTrialFlag) -> int:
     return int(np.count_nonzero(flags))
-
-
-HEADER = (
-    "            settled   settling time [s]   rise [s]   overshoot [%]   steady-state error",
-    "                        median      p95     median    median   p95   median       p95",
-)
-
-
-def _row(channel: str, trials: int, judged: dict) -> str:
-    """One line of the table, under HEADER."""
-    scale, unit = (math.degrees(1), "deg") if channel == "yaw" else (1e3, "mm")
-    settled, settling, over = f"{judged['settled']}/{trials}", judged["settling_time"], judged["overshoot"]
-    rise = _number(judged["rise_time"]["median"], 2) if "rise_time" in judged else ""
-    error = [
-        _number(judged["steady_state_error"][level], 2 if unit == "deg" else 1, scale) for level in ("median", "p95")
-    ]
-    return (
-        f"{channel:<10}{settled:>9}"
-        f"{_number(settling['median'], 2):>11}{_number(settling['p95'], 2):>9}{rise:>11}"
-        f"{_number(over['median'], 1, 100.0):>10}{_number(over['p95'], 1, 100.0):>6}"
-        f"{error[0]:>9}{error[1]:>10} {unit}"
-    )
-
-
-def _footer(judged: dict) -> list[str]:
-    """What does not belong to one channel: failures, then speed, action and efficiency."""
-    crossed = ", ".join(f"{name} {count}" for name, count in judged["violations"].items()) or "none"
-    small = ", ".join(f"{axis} {judged['axes'][axis]['small_steps']}" for axis in AXES)
-    peak, action = judged["peak_speed"], judged["action"]
-    return [
-        f"crashed {judged['crashed']}   infeasible {judged['infeasible']}   trials that crossed a bound: {crossed}",
-        f"peak speed {_number(peak['median'], 2)} m/s (p95 {_number(peak['p95'], 2)})   action rms "
-        f"{_number(action['rms'], 3)}, total variation {_number(action['total_variation'], 4)}   "
-        f"efficiency {_number(judged['efficiency']['median'], 2)}",
-        f"steps too small for overshoot and rise: {small}",
-    ]
-
-
-def _number(value: float | None, decimals: int, scale: float = 1.0) -> str:
-    return "-" if value is None else f"{value * scale:.{decimals}f}"

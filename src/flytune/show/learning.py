@@ -35,7 +35,7 @@ def learning(rows: Rows | None) -> go.Figure | str:
         ("reward per episode", [_line(steps, _number(rows, "episode_reward"), "episode", style.INK, 1.8)]),
         ("episodes ended per update", causes),
     )
-    drawable = [(title, lines) for title, lines in panels if any(np.isfinite(line.y).any() for line in lines)]
+    drawable = [(title, lines) for title, lines in panels if any(_has_number(line) for line in lines)]
     if not drawable or not np.isfinite(steps).any():
         return "The training left no numbers that could be drawn."
     return _stack(drawable)
@@ -50,19 +50,24 @@ def _stack(panels: Sequence[tuple[str, list[go.Scatter]]]) -> go.Figure:
     """The panels above each other over one axis of steps, each with a legend of its own beside it."""
     number = len(panels)
     titles = [heading(title) for title, _ in panels]
-    figure = make_subplots(number, 1, shared_xaxes=True, vertical_spacing=0.2 / number, subplot_titles=titles)
+    gap = 0.2 / number
+    figure = make_subplots(number, 1, shared_xaxes=True, vertical_spacing=gap, subplot_titles=titles)
     legends = {}
     for row, (title, lines) in enumerate(panels, start=1):
         legend = "legend" if row == 1 else f"legend{row}"
         for line in lines:
             figure.add_trace(line.update(legend=legend, showlegend=title != "reward per episode"), row=row, col=1)
-        top = figure.layout[f"yaxis{row}" if row > 1 else "yaxis"].domain[1]
-        legends[legend] = {"orientation": "v", "x": 1.01, "xanchor": "left", "y": top, "yref": "paper"}
+        top = 1 - (row - 1) * (1 + gap) / number
+        legends[legend] = {"orientation": "v", "x": 1.01, "xanchor": "left", "y": top, "yanchor": "top"}
         figure.update_yaxes(title_text="reward [1]" if "reward" in title else "episodes [1]", row=row, col=1)
     figure.update_xaxes(hoverformat=",.3s")
     figure.update_xaxes(title_text="environment steps [1]", row=number, col=1)
     margin = {"l": 66, "r": 14, "t": 40, "b": 48}
     return style.frame(figure, 90 + 240 * number, hovermode="x", margin=margin, **legends)
+
+
+def _has_number(line: go.Scatter) -> bool:
+    return bool(np.isfinite(np.asarray(line.y, dtype=float)).any())
 
 
 def _line(steps: Course, values: Course, name: str, colour: str, width: float = 1.2) -> go.Scatter:
@@ -88,13 +93,13 @@ def _table(rows: Rows, key: str) -> list[tuple[str, Course]]:
     return [(name, np.array([_float((row.get(key) or {}).get(name)) for row in rows])) for name in names]
 
 
-def _float(value: float | None) -> float:
+def _float(value: float | int | None) -> float:
     return np.nan if value is None else float(value)
 
 
 def _thin(values: Course) -> Course:
     """At most POINTS values, each the mean of neighbours; NaN only where all of them are."""
-    size = -(-len(values) // POINTS)
+    size = max(1, -(-len(values) // POINTS))
     padded = np.append(values, np.full(-len(values) % size, np.nan)).reshape(-1, size)
     known = np.isfinite(padded)
     total, count = np.where(known, padded, 0.0).sum(axis=1), known.sum(axis=1)

@@ -25,7 +25,7 @@ h2 { font-size: 1.5rem; line-height: 1.25; margin: 56px 0 4px; padding-top: 24px
 h3 { font-size: 1.1rem; margin: 36px 0 6px; }
 p { margin: 6px 0 12px; max-width: 78ch; }
 .quiet, figcaption, .empty { color: #52606d; }
-.lead { font-size: 1.12rem; }
+.lead { font-size: 1.12rem; max-width: none; }
 a { color: #0b5fa5; text-decoration-thickness: 1px; text-underline-offset: 2px; }
 nav { display: flex; flex-wrap: wrap; gap: 4px 18px; margin: 12px 0 4px; font-size: 0.93rem; }
 nav ol { margin: 0; padding-left: 1.4em; overflow-wrap: anywhere; }
@@ -33,7 +33,7 @@ nav ol { margin: 0; padding-left: 1.4em; overflow-wrap: anywhere; }
 table { border-collapse: collapse; width: 100%; font-size: 0.93rem; font-variant-numeric: tabular-nums; }
 thead th { font-weight: 600; border-bottom: 1px solid #cbd2d9; padding: 3px 10px; text-align: right; line-height: 1.3; }
 thead th[colspan] { text-align: center; }
-thead th:first-child, tbody th { text-align: left; padding-left: 0; }
+thead tr:first-child th:first-child { text-align: left; padding-left: 0; }
 thead tr + tr th { font-weight: 400; color: #52606d; text-align: right; }
 tbody th, tbody td { padding: 5px 10px; border-bottom: 1px solid #e4e7eb; text-align: right; white-space: nowrap; }
 tbody th { text-align: left; padding-left: 0; font-weight: 600; }
@@ -43,7 +43,7 @@ dd { margin: 0; overflow-wrap: anywhere; font-variant-numeric: tabular-nums; }
 figure { margin: 10px 0 6px; }
 figcaption { font-size: 0.93rem; max-width: 88ch; margin-top: 4px; }
 .figure { overflow-x: auto; overflow-y: hidden; }
-.figure > div { min-width: 680px; }
+.figure > div { min-width: 720px; }
 .empty { border-left: 3px solid #cbd2d9; padding: 6px 14px; }
 code, pre { font-family: ui-monospace, SFMono-Regular, Menlo, Consolas, 'DejaVu Sans Mono', monospace; }
 pre { font-size: 0.8rem; line-height: 1.5; background: #f7f8f9; border: 1px solid #e4e7eb; border-radius: 4px;
@@ -66,7 +66,11 @@ pre i { color: #7b8794; font-style: normal; }
 # Figures are drawn when they come near the window: a page of many policies opens at once. Browsers keep only about a
 # dozen WebGL contexts, so figures in space are given back when they are far away again.
 SCRIPT = """
-const config = {responsive: true, displaylogo: false, scrollZoom: false};
+const config = {
+  responsive: true, displaylogo: false, scrollZoom: false,
+  showSendToCloud: false,  // plotly.js offers an upload of the figure to its maker's server
+  modeBarButtonsToRemove: ["select2d", "lasso2d", "autoScale2d", "resetCameraLastSave3d"],
+};
 const plots = document.querySelectorAll(".figure > div");
 const draw = plot => {
   if (plot.dataset.drawn) return;

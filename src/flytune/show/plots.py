@@ -30,8 +30,8 @@ def response(flights: Flights, judgement: Judgement, task: Task) -> go.Figure:
     figure = make_subplots(
         rows,
         2,
-        shared_xaxes="all",
-        vertical_spacing=0.028,
+        shared_xaxes="all",  # pyright: ignore[reportArgumentType]  (its stub knows booleans only)
+        vertical_spacing=0.04,
         horizontal_spacing=0.09,
         column_widths=[0.6, 0.4],
         specs=[[{}, {}]] * len(AXES) + [[{"colspan": 2}, None]],
@@ -54,8 +54,9 @@ def response(flights: Flights, judgement: Judgement, task: Task) -> go.Figure:
     _draw_altitude_bounds(figure, task, row=AXES.index("z") + 1)
     _draw_speed(figure, flights, judgement, shown, row=rows)
     figure.update_xaxes(range=[0, flights.duration], hoverformat=".2f")
+    figure.update_xaxes(showticklabels=True, row=len(AXES))
     figure.update_xaxes(title_text="time [s]", row=rows, col=1)
-    return style.frame(figure, 900, hovermode="x", margin={"l": 66, "r": 14, "t": 76, "b": 48})
+    return style.frame(figure, 920, hovermode="x")
 
 
 def _stride(flights: Flights) -> int:
@@ -80,7 +81,12 @@ def _curve(
         dx=step * float(flights.time[1]),
         y=values[::step].astype(np.float32),
         mode="lines",
-        line={"color": style.TRIALS[trial], "width": 1.3, "dash": "dot" if "crashed" in name else "solid"},
+        line={
+            "color": style.TRIALS[trial],
+            "width": 1.3,
+            "dash": "dot" if "crashed" in name else "solid",
+            "simplify": False,
+        },
         name=name,
         legendgroup=str(trial),
         showlegend=legend,
@@ -138,28 +144,28 @@ def _draw_speed(figure: go.Figure, flights: Flights, judgement: Judgement, shown
 def spread(judgement: Judgement) -> go.Figure | str:
     """Box plots of settling time, overshoot and steady-state error per axis, with the number of trials in each box."""
     panels = (
-        ("settling time [s]", ("x", "y", "z", "yaw"), judgement.settling_time, 1.0, 1.0),
-        ("overshoot [% of the step]", ("x", "y", "z", "yaw"), judgement.overshoot, 100.0, 100.0),
-        ("steady-state error [mm]", ("x", "y", "z"), judgement.steady_state_error, 1e3, 0.0),
-        ("steady-state error [deg]", ("yaw",), judgement.steady_state_error, 0.0, math.degrees(1)),
+        ("settling time", "settling time [s]", AXES, judgement.settling_time, 1.0),
+        ("overshoot", "overshoot [% of the step]", AXES, judgement.overshoot, 100.0),
+        ("steady-state error", "error [mm]", ("x", "y", "z"), judgement.steady_state_error, 1e3),
+        ("", "error [deg]", ("yaw",), judgement.steady_state_error, math.degrees(1)),
     )
     figure = make_subplots(
         1,
         len(panels),
-        column_widths=[0.31, 0.31, 0.24, 0.1],
-        horizontal_spacing=0.06,
+        column_widths=[0.31, 0.31, 0.24, 0.14],
+        horizontal_spacing=0.07,
         subplot_titles=[heading(title) for title, *_ in panels],
     )
     drawn = 0
-    for column, (title, axes, values, scale, yaw_scale) in enumerate(panels, start=1):
+    for column, (_, unit, axes, values, scale) in enumerate(panels, start=1):
         ticks = []
         for place, axis in enumerate(axes):
-            finite = values[axis][np.isfinite(values[axis])] * (yaw_scale if axis == "yaw" else scale)
+            finite = values[axis][np.isfinite(values[axis])] * scale
             drawn += finite.size
             ticks.append(f"{axis}<br>{finite.size}/{judgement.trials}")
             figure.add_trace(_box(finite, place, axis), row=1, col=column)
         figure.update_xaxes(tickvals=list(range(len(axes))), ticktext=ticks, range=[-0.6, len(axes) - 0.4], col=column)
-        figure.update_yaxes(title_text=title, rangemode="tozero", col=column)
+        figure.update_yaxes(title_text=unit, rangemode="tozero", col=column)
     if not drawn:
         return "Every trial crashed, so there is no settling time, overshoot or steady-state error to draw."
     figure.update_xaxes(showgrid=False)
@@ -208,21 +214,22 @@ def settled_share(judgements: Sequence[tuple[str, Judgement]]) -> go.Figure:
     figure.update_xaxes(title_text="time [s]", range=[0, longest])
     figure.update_yaxes(range=[-2, 103])
     figure.update_yaxes(title_text="settled [% of trials]", col=1)
-    return style.frame(figure, 380 + 14 * (len(judgements) // 4), margin={"l": 66, "r": 14, "t": 90, "b": 48})
+    above = 60 + 20 * ((len(judgements) - 1) // 3)  # the names take a line for every three or so
+    return style.frame(figure, 300 + above, margin={"l": 66, "r": 14, "t": above, "b": 48})
 
 
 def margins(flights: Flights, judgement: Judgement) -> go.Figure | str:
     """Share of each termination's bound that is left over time: median, p5 to p95 and extremes over the trials."""
     if not flights.margins:
         return "The task has no termination condition, so there is no margin to draw."
-    names = list(flights.margins)
-    columns, rows = min(2, len(names)), math.ceil(len(names) / 2)
+    names = sorted(flights.margins, key=lambda name: _tightness(flights.margins[name]))
+    columns, rows = min(3, len(names)), math.ceil(len(names) / 3)
     titles = [
-        f"{heading(label(name))}: {np.count_nonzero(judgement.violated[name])} of {flights.trials} trials cross it"
+        f"{heading(label(name, 26))}<br>crossed in {np.count_nonzero(judgement.violated[name])} of {flights.trials}"
         for name in names
     ]
     figure = make_subplots(
-        rows, columns, shared_xaxes=True, vertical_spacing=0.24 / rows, horizontal_spacing=0.09, subplot_titles=titles
+        rows, columns, shared_xaxes=True, vertical_spacing=0.32 / rows, horizontal_spacing=0.07, subplot_titles=titles
     )
     for index, name in enumerate(names):
         row, column = divmod(index, columns)
@@ -231,8 +238,13 @@ def margins(flights: Flights, judgement: Judgement) -> go.Figure | str:
     for column in range(columns):
         last = max(range(column, len(names), columns)) // columns + 1
         figure.update_xaxes(title_text="time [s]", row=last, col=column + 1)
-    figure.update_yaxes(title_text="margin [% of bound]")
-    return style.frame(figure, 120 + 200 * rows, hovermode="x", margin={"l": 66, "r": 14, "t": 76, "b": 48})
+    figure.update_yaxes(title_text="margin [% of bound]", col=1)
+    return style.frame(figure, 110 + 240 * rows, hovermode="x", margin={"l": 66, "r": 14, "t": 86, "b": 48})
+
+
+def _tightness(margin: Float[np.ndarray, "N K"]) -> float:
+    """What the median trial left of a bound at its worst instant: the smaller, the more the bound holds back."""
+    return float(np.median(np.where(np.isfinite(margin), margin, -np.inf).min(axis=1)))
 
 
 def _draw_margin(
@@ -275,11 +287,11 @@ def flights_3d(flights: Flights) -> go.Figure:
     figure = go.Figure()
     step = 2 * _stride(flights)
     shown = min(TRIALS_SHOWN, flights.trials)
-    behind = flights.position[shown : shown + TRIALS_BEHIND, ::step]
+    behind = flights.position[shown : shown + TRIALS_BEHIND, :: 2 * step]
     if len(behind):
         gaps = np.full((len(behind), 1, 3), np.nan)  # so that one trace holds many separate lines
         points = np.concatenate([behind, gaps], axis=1).reshape(-1, 3)
-        figure.add_trace(_path(points, style.OTHERS, 1.5, f"{len(behind)} more trials"))
+        figure.add_trace(_path(points, style.OTHERS, 2, f"{len(behind)} more trials"))
     for trial in range(shown):
         path = flights.position[trial, ::step]
         figure.add_trace(_path(path, style.TRIALS[trial], 4, f"trial {trial + 1}", group=str(trial)))
@@ -289,9 +301,9 @@ def flights_3d(flights: Flights) -> go.Figure:
     scene: Mapping[str, Any] = {
         **{f"{name}axis": {**axis, "title": {"text": f"{name} [m]"}} for name in "xyz"},
         "aspectmode": "data",
-        "camera": {"eye": {"x": 1.25, "y": -1.35, "z": 0.75}},
+        "camera": {"eye": {"x": 1.35, "y": -1.55, "z": 0.8}, "center": {"x": 0, "y": 0, "z": -0.15}},
     }
-    return style.frame(figure, 620, scene=scene, margin={"l": 0, "r": 0, "t": 40, "b": 0})
+    return style.frame(figure, 560, scene=scene, margin={"l": 0, "r": 0, "t": 40, "b": 0})
 
 
 def _path(points: Float[np.ndarray, "M 3"], colour: str, width: float, name: str, group: str = "") -> go.Scatter3d:

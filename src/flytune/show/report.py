@@ -1,6 +1,9 @@
 """The report: one self-contained page on what one or several policies fly like, and how they came to."""
 
+import contextlib
 import dataclasses
+import math
+import os
 from collections.abc import Sequence
 from html import escape
 from pathlib import Path
@@ -50,9 +53,9 @@ def write_report(path: Path, entries: Sequence[Entry]) -> None:
     """
     if not entries:
         raise BadInput("report: no policy. Allowed: one or more. Name a run directory, a policy file or a controller.")
-    if not path.parent.is_dir():
+    if not os.path.isdir(path.parent):  # unlike Path.is_dir, also where the name itself is too long
         raise BadInput(f"out: {path.parent} is no folder. Allowed: a file in a folder that exists. Make it first.")
-    if path.is_dir():
+    if os.path.isdir(path):
         raise BadInput(f"out: {path} is a folder. Allowed: a file, for instance {path / 'report.html'}.")
     text = _page(entries)
     whole = path.with_name(path.name + ".part")
@@ -60,6 +63,8 @@ def write_report(path: Path, entries: Sequence[Entry]) -> None:
         whole.write_text(text, encoding="utf-8", errors="replace")  # a file name need not be valid Unicode
         whole.replace(path)
     except OSError as error:
+        with contextlib.suppress(OSError):
+            whole.unlink()
         raise BadInput(f"out: {path} cannot be written ({error.strerror}). Allowed: a file you may write.") from None
 
 
@@ -98,14 +103,15 @@ def _section(entry: Entry, anchor: str) -> str:
         "margins": page.drawing(plots.margins(entry.flights, entry.judgement), _CAPTIONS["margins"]),
         "space": page.drawing(plots.flights_3d(entry.flights), _CAPTIONS["space"]),
         "learning": _learning(entry),
-        "task": f"<p>Every number this policy was trained with, its unit, what is allowed, and where it comes from.</p>"
+        "task": "<p>Every number this policy was trained with, its unit, what is allowed, and where it comes from.</p>"
         f"{tables.task_listing(entry.task)}",
         "about": tables.definitions(entry.about) if entry.about else '<p class="empty">Nothing is known of it.</p>',
     }
     links = "".join(f'<a href="#{anchor}-{key}">{SECTIONS[key]}</a>' for key in parts)
     body = "".join(f'<h3 id="{anchor}-{key}">{SECTIONS[key]}</h3>{html}' for key, html in parts.items())
-    task = escape(entry.judgement.task)
-    return f'<p class="quiet">on task {task}</p><p class="lead">{tables.verdict(entry.judgement)}</p><nav>{links}</nav>{body}'
+    flown = f"on {entry.judgement.task}, vehicle {entry.judgement.vehicle}, world {entry.judgement.world}"
+    verdict = tables.verdict(entry.judgement)
+    return f'<p class="quiet">{escape(flown)}</p><p class="lead">{verdict}</p><nav>{links}</nav>{body}'
 
 
 def _response(entry: Entry) -> str:
@@ -125,21 +131,29 @@ def _learning(entry: Entry) -> str:
 
 
 _CAPTIONS = {
-    "dash": '<p class="quiet">Quantiles are over all trials; one that failed counts as infinite, and – says that the '
-    "quantile falls among those.</p>",
-    "share": "Higher and further left is better. A line that stays below 100 % belongs to a policy that leaves trials "
-    "unsettled.",
-    "response": "The first trials of the evaluation. A dot marks the instant from which a trial stays in the settling "
-    f"band (green, ± {metrics.POSITION_BAND:g} m and ± {2 / 100 * 180:g} deg); dashed is the target, red are the bounds "
-    "of the task. Look for a dot on every curve, for curves that cross the target (overshoot), and, close up, for "
-    "offsets that stay.",
-    "spread": "Each dot is a trial, each box holds the middle half of the trials drawn, whose number stands under it. "
-    "Missing are trials that did not settle (settling time), that crashed (all), or whose step is too small for an "
-    "overshoot. A box that is a line at zero overshoot is a response that never passes its target.",
-    "margins": "How much of each bound of the task is left, over all trials. At the red line the bound is reached, "
-    "below it training would have ended the episode. A margin close to the line is the bound that holds the pilot back.",
-    "space": "Turn it by dragging. Dots are starts, the red diamond is the target. Look for detours, and for flights "
-    "that come in from one side only.",
-    "learning": "Look for a reward that has stopped rising, for a term that others outweigh (a flat line far below its "
-    "weight), and for terminations that die out; click a name to hide its line.",
+    "dash": f"""
+<p class="quiet">Quantiles are over all trials; one that failed counts as infinite, and {tables.DASH} says that the
+quantile falls among those.</p>""",
+    "share": """
+Higher and further left is better. A line that stays below 100&nbsp;% belongs to a policy that leaves trials
+unsettled.""",
+    "response": f"""
+The first trials of the evaluation. A dot marks the instant from which a trial stays in the settling band (green,
+±&nbsp;{metrics.POSITION_BAND:g}&nbsp;m and ±&nbsp;{math.degrees(metrics.YAW_BAND):g}&nbsp;deg); dashed is the target,
+red are the bounds of the task, dotted are trials that crashed. Look for a dot on every curve, for curves that cross
+the target (overshoot), and, close up, for offsets that stay.""",
+    "spread": """
+Each dot is a trial, each box holds the middle half of the trials drawn; under it stands how many of all these are.
+Missing are trials that did not settle (settling time), that crashed (all three), or whose step is too small for an
+overshoot. A box that is a line at zero overshoot is a response that never passes its target.""",
+    "margins": """
+How much of each bound of the task is left, over all trials, the tightest bound first. At the red line the bound is
+reached, below it training would have ended the episode. A margin that stays near the line is what holds the pilot
+back; one far above it (an altitude of several times its bound) could as well not be there.""",
+    "space": """
+Turn it by dragging. Dots are starts, the red diamond is the target. Look for detours, and for flights that come in
+from one side only.""",
+    "learning": """
+Look for a reward that has stopped rising, for a term that others outweigh (a flat line far below its weight), and for
+terminations that die out; click a name to hide its line.""",
 }

@@ -7,7 +7,7 @@ from typing import Any
 import plotly.graph_objects as go
 
 INK, QUIET, HAIRLINE = "#1f2933", "#7b8794", "#e4e7eb"
-BOUND, BAND, OTHERS = "#b3261e", "rgba(46, 125, 50, 0.16)", "rgba(123, 135, 148, 0.35)"
+BOUND, BAND, OTHERS = "#b3261e", "rgba(46, 125, 50, 0.16)", "#cdd3da"
 TRIALS = ("#0b5fa5", "#d1690e", "#12805c", "#8e4585", "#a58a00")  # after Okabe and Ito, darkened for thin lines
 AXES = {"x": "#0b5fa5", "y": "#12805c", "z": "#8e4585", "yaw": "#d1690e"}
 MANY = (*TRIALS, "#4aa3c7", "#6b7280", "#c2567a", "#5b7a1e", "#3f3d99")  # reward terms, causes, policies

@@ -13,6 +13,7 @@ from flytune.show.style import listed
 from flytune.task.task import Task, write_task
 
 Row = Sequence[str]
+DASH = "\N{EN DASH}"
 COMMENT = re.compile(r"""^((?:"(?:\\.|[^"\\])*"|'[^']*'|[^"'#])*)(#.*)$""")  # a # inside quotes begins no comment
 
 
@@ -24,12 +25,11 @@ def verdict(judgement: Judgement) -> str:
     text = f"<strong>{np.count_nonzero(settled)} of {judgement.trials}</strong> trials settle on all four axes"
     if len(reached) == len(AXES):
         slowest = max(reached, key=reached.__getitem__)
-        text += (
-            f"; the slowest axis is {slowest}, with a median settling time of <strong>{reached[slowest]:.2f} s</strong>"
-        )
+        median = f"<strong>{reached[slowest]:.2f}&nbsp;s</strong>"
+        text += f"; the slowest axis is {slowest}, with a median settling time of {median}"
     else:
         late = listed([axis for axis in AXES if axis not in reached])
-        text += f"; half of the trials or more do not settle on {late}"
+        text += f"; fewer than half settle on {late}"
     return text + "."
 
 
@@ -76,10 +76,10 @@ def facts(judgement: Judgement, speed_bound: float | None) -> str:
         {
             "crashed": f"{judged['crashed']} of {judgement.trials} trials",
             "infeasible": f"{judged['infeasible']} of {judgement.trials} trials (nobody could settle these in time)",
-            "trials that crossed a bound": ", ".join(crossed) or "the task has no bound",
+            "trials that crossed a bound": ", ".join(crossed) or "none, the task has no bound",
             "peak speed": f"{number(peak['median'], 2)} m/s median, {number(peak['p95'], 2)} m/s p95 ({bound})",
             "efficiency": f"{number(judged['efficiency']['median'], 2)} median (physical bound / settling time)",
-            "action": f"{number(action['rms'], 3)} RMS, {number(action['total_variation'], 4)} change per step and motor",
+            "action": f"{number(action['rms'], 3)} RMS, changes by {number(action['total_variation'], 4)} a step",
             "too small a step for overshoot": f"{small} trials",
             "flown": f"{judgement.trials} trials of {judgement.duration:g} s, starts {judgement.starts}, "
             f"seed {judgement.seed}, vehicle {judgement.vehicle}, world {judgement.world}",
@@ -88,10 +88,11 @@ def facts(judgement: Judgement, speed_bound: float | None) -> str:
 
 
 def comparison_table(judged: Sequence[tuple[str, str, Judgement]]) -> str:
-    """One row per policy (anchor, name, judgement): settled trials and median settling time per axis, error, failures."""
+    """One row per policy (anchor, name, judgement): settled trials, settling time per axis, error, failures."""
     head = (
-        '<tr><th rowspan="2">policy</th><th rowspan="2">task</th><th colspan="4">settled</th>'
-        '<th colspan="4">settling time, median [s]</th><th colspan="2">error, median</th>'
+        '<tr><th rowspan="2">policy</th><th rowspan="2">task</th><th rowspan="2">trials</th>'
+        '<th colspan="4">settled</th>'
+        '<th colspan="4">settling time [s], median</th><th colspan="2">error, median</th>'
         '<th rowspan="2">peak speed<br>[m/s]</th><th rowspan="2">action<br>RMS</th><th rowspan="2">crashed</th></tr>'
         "<tr>"
         + "".join(f"<th>{axis}</th>" for axis in AXES) * 2
@@ -105,7 +106,8 @@ def comparison_table(judged: Sequence[tuple[str, str, Judgement]]) -> str:
             (
                 f'<a href="#{anchor}">{escape(name)}</a>',
                 escape(judgement.task),
-                *(f"{axes[axis]['settled']}/{judgement.trials}" for axis in AXES),
+                str(judgement.trials),
+                *(str(axes[axis]["settled"]) for axis in AXES),
                 *(number(axes[axis]["settling_time"]["median"], 2) for axis in AXES),
                 number(told["position"]["steady_state_error"]["median"], 1, 1e3),
                 number(axes["yaw"]["steady_state_error"]["median"], 2, math.degrees(1)),
@@ -125,7 +127,9 @@ def differences_table(tasks: Sequence[tuple[str, Task]]) -> str:
     if not differing:
         return "<p>All were given the same task, number by number.</p>"
     head = "<tr><th>field</th>" + "".join(f"<th>{escape(name)}</th>" for name, _ in tasks) + "</tr>"
-    rows = [(f"<code>{escape(path)}</code>", *(escape(leaves.get(path, "–")) for leaves in flat)) for path in differing]
+    rows = [
+        (f"<code>{escape(path)}</code>", *(escape(leaves.get(path, DASH)) for leaves in flat)) for path in differing
+    ]
     return _table(head, rows)
 
 
@@ -157,7 +161,7 @@ def definitions(items: Mapping[str, str]) -> str:
 
 def number(value: float | None, decimals: int, scale: float = 1.0) -> str:
     """A number for a cell; a dash where a quantile is infinite."""
-    return "–" if value is None else f"{value * scale:.{decimals}f}"
+    return DASH if value is None else f"{value * scale:.{decimals}f}"
 
 
 def _table(head: str, rows: Sequence[Row]) -> str:

@@ -3,7 +3,6 @@
 from typing import Annotated
 
 import jax
-import jax.numpy as jnp
 from annotated_types import Ge, Unit
 from jaxtyping import Array, Float
 
@@ -15,6 +14,7 @@ from flytune.pytree import pytree
 from flytune.task.situation import Target, attitude_error, position_error
 
 SIZE = 17
+BLOCKS = (3, 4, 3, 3, 4)  # position error, attitude error, velocity, body rate, last action
 NOISY = 13  # the first 13 carry noise; the last action does not
 LAYOUT = (
     "position_error (3) [m], attitude_error (4) [x y z w], velocity (3) [m/s, inertial], "

@@ -87,6 +87,15 @@ def load_task(task: str | Path, edits: dict[str, Any] | None = None) -> Task:
     return document.read(Task, complete)
 
 
+def read_task_text(text: str, where: str) -> Task:
+    """A task from its complete TOML text, as `write_task` gives it.
+
+    Raises:
+        BadInput: not a task.
+    """
+    return document.read(Task, document.parse(text, where), where)
+
+
 def write_task(task: Task) -> str:
     """The TOML text of a task: exact, complete, and with unit, range and source beside each number."""
     sources = dict(task.sources) | {f"vehicle.{path}": text for path, text in task.vehicle.sources.items()}

@@ -63,7 +63,7 @@ class MaximumAttitudeError:
 
 @pytree
 class MaximumTilt:
-    """Ends an episode that rolls or pitches too far, in place of the geodesic bound (H10). Source: paper R14, 15 deg."""
+    """Ends an episode that rolls or pitches too far, in place of the geodesic bound (H10). Source: paper R14."""
 
     kind: Literal["maximum_tilt"] = static(default="maximum_tilt")
     bound_deg: Annotated[Real, Gt(0), Le(180), Unit("deg")]

@@ -1,13 +1,16 @@
 """Trainer settings: how a task is learned, kept beside what is learned so that one file says all (paper R16 to R18)."""
 
+import math
 from typing import Annotated
 
 from annotated_types import Ge, Gt, Le, Lt, Unit
 
 from flytune.document import Real, Whole
 from flytune.pytree import pytree
+from flytune.task.initial_state import InitialState
 
 Share = Annotated[Real, Ge(0), Le(1), Unit("1")]
+Positive = Annotated[Real, Gt(0), Unit("1")]
 Count = Annotated[Whole, Ge(1)]
 
 
@@ -35,23 +38,35 @@ class PpoSettings:
         """What makes the numbers impossible together, or None."""
         samples = self.environments * self.rollout
         if samples % self.minibatch:
-            return f"minibatch: {self.minibatch} does not divide environments * rollout = {samples}. Allowed: a divisor."
+            return (
+                f"minibatch: {self.minibatch} does not divide environments * rollout = {samples}. Allowed: a divisor."
+            )
         return None
 
 
 @pytree
 class ApgSettings:
-    """Analytic policy gradient: gradient ascent on the reward, through the simulator (our own; not in the paper)."""
+    """Analytic policy gradient: gradient ascent on the reward, through the simulator (our own; not in the paper).
 
-    updates: Count = 400
+    It trains from its own, wider starts: a policy that keeps the speed bound from 2 m away has to have been there.
+    """
+
+    initial_state: InitialState = InitialState(
+        lowest_position=(-2.0, -2.0, 0.1),
+        highest_position=(2.0, 2.0, 2.0),
+        largest_tilt=0.27,
+        largest_yaw=math.pi,
+    )
+    updates: Count = 300
     environments: Count = 64
     window: Annotated[Whole, Ge(1), Unit("steps")] = 250  # what one gradient looks through
-    learning_rate: Annotated[Real, Gt(0), Unit("1")] = 2e-3
+    learning_rate: Annotated[Real, Gt(0), Unit("1")] = 5e-3
     final_learning_rate: Share = 0.02  # as a share of the first, reached by a cosine
     momentum: Annotated[Real, Ge(0), Lt(1), Unit("1")] = 0.7  # Adam's b1
     second_momentum: Annotated[Real, Ge(0), Lt(1), Unit("1")] = 0.95  # Adam's b2
     gradient_norm: Annotated[Real, Gt(0), Unit("1")] = 1.0
-    barrier_weight: Annotated[Real, Ge(0), Unit("1")] = 300.0
+    barrier_weight: Annotated[Real, Ge(0), Unit("1")] = 30.0
     barrier_margin: Annotated[Real, Ge(0), Lt(1), Unit("1")] = 0.1  # the barrier begins where less than this is left
+    input_scale: tuple[Positive, Positive, Positive, Positive, Positive] = (2.0, 3.0, 2.0, 0.3, 1.0)  # per block of R7
     hidden: tuple[Count, ...] = (64, 64)
     average: Annotated[Real, Ge(0), Lt(1), Unit("1 per update")] = 0.95

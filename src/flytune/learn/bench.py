@@ -1,0 +1,141 @@
+"""Throughput on this machine, as ratios measured in one run, since a time alone says more about the machine."""
+
+import dataclasses
+import itertools
+import os
+import time
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from flytune import env
+from flytune.learn import apg, ppo
+from flytune.learn.run import steps_per_update
+from flytune.task.observation import NOISY
+from flytune.task.task import Task, load_task
+from flytune.task.training import PpoSettings
+
+BATCH, WIDTH = 128, 64  # of the matrix product everything is compared with: 128 x 64 times 64 x 64, float32
+REPEATS = 5  # the fastest counts: other work on the machine only ever slows a run down
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Throughput:
+    """What was measured; rates in environment steps per second."""
+
+    matrix_product: float  # floating-point operations per second
+    ppo: float | None
+    ppo_share_of_limit: float | None  # of what the matrix product alone would allow
+    apg: float | None
+    simulate: float | None
+    device: str
+    cores: int | None
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values, for JSON."""
+        return dataclasses.asdict(self)
+
+    def table(self) -> str:
+        """The measurements for a terminal."""
+        lines = [
+            f"device {self.device}, {self.cores} cores, XLA_FLAGS={os.environ.get('XLA_FLAGS', '')!r}",
+            f"{BATCH} x {WIDTH} x {WIDTH} float32 matrix product   {self.matrix_product / 1e9:8.1f} GFLOP/s",
+        ]
+        if self.ppo is not None and self.ppo_share_of_limit is not None:
+            lines.append(
+                f"train ppo (128 environments x 128 steps)   {self.ppo:10,.0f} steps/s   "
+                f"{self.ppo_share_of_limit:.2f} of the product's limit"
+            )
+        if self.apg is not None:
+            lines.append(f"train apg (forward and backward)           {self.apg:10,.0f} steps/s")
+        if self.simulate is not None:
+            lines.append(f"simulate (observe, step, reward, reset)    {self.simulate:10,.0f} steps/s")
+        return "\n".join(lines)
+
+
+def bench(what: str = "all") -> Throughput:
+    """Throughput of training and of simulation, beside that of a plain matrix product timed in the same run.
+
+    Args:
+        what: `train`, `simulate` or `all`.
+    """
+    task = load_task("baseline")
+    training, simulation = what in ("all", "train"), what in ("all", "simulate")
+    product = _matrix_product()
+    ppo_rate = _training(ppo, task, task.ppo, steps_per_update(task, "ppo")) if training else None
+    return Throughput(
+        matrix_product=max(product, _matrix_product()),
+        ppo=ppo_rate,
+        ppo_share_of_limit=ppo_rate * operations_per_step(task.ppo) / product if ppo_rate else None,
+        apg=_training(apg, task, task.apg, steps_per_update(task, "apg")) if training else None,
+        simulate=_simulation(task) if simulation else None,
+        device=jax.devices()[0].platform,
+        cores=os.cpu_count(),
+    )
+
+
+def operations_per_step(settings: PpoSettings) -> float:
+    """Floating-point operations the networks of PPO need per environment step, products alone.
+
+    Each epoch runs actor and critic forward and backward (3 times forward), the rollout runs the actor once and the
+    critic twice (before and after the step); a multiplication and its addition count as two.
+    """
+    sizes = (17, *settings.hidden)
+    trunk = sum(a * b for a, b in itertools.pairwise(sizes))
+    actor, critic = trunk + 4 * sizes[-1], trunk + sizes[-1]
+    return 2.0 * (3 * settings.epochs * (actor + critic) + actor + 2 * critic)
+
+
+def _fastest(run: Callable[[], Any]) -> float:
+    jax.block_until_ready(run())
+    times = []
+    for _ in range(REPEATS):
+        started = time.perf_counter()
+        jax.block_until_ready(run())
+        times.append(time.perf_counter() - started)
+    return min(times)
+
+
+def _matrix_product() -> float:
+    first = jax.random.normal(jax.random.key(0), (BATCH, WIDTH))
+    second = jax.random.normal(jax.random.key(1), (WIDTH, WIDTH)) / WIDTH**0.5
+    number = 5000
+
+    @jax.jit
+    def chain(first: jax.Array) -> jax.Array:
+        return jax.lax.scan(lambda x, _: (x @ second, None), first, length=number)[0]
+
+    return 2.0 * BATCH * WIDTH * WIDTH * number / _fastest(lambda: chain(first))
+
+
+def _training(teacher: Any, task: Task, settings: Any, samples: int) -> float:
+    learner = teacher.start(task, settings, jax.random.key(0))
+
+    def one() -> Any:
+        nonlocal learner
+        learner, seen = teacher.update(task, settings, learner)
+        return seen
+
+    return samples / _fastest(one)
+
+
+def _simulation(task: Task, environments: int = 1024, steps: int = 200) -> float:
+    keys = jax.random.split(jax.random.key(0), environments)
+    episodes = jax.vmap(lambda key: env.reset(task, key), out_axes=-1)(keys)
+
+    def one_step(episode: env.Episode, normal: jax.Array, key: jax.Array) -> Any:
+        seen = env.look(task, episode, normal)
+        moved, outcome = env.step(task, episode, 0.1 * seen[:4])
+        return env.autoreset(task, moved, outcome, key), outcome.reward
+
+    @jax.jit
+    def fly(episodes: env.Episode, key: jax.Array) -> Any:
+        noise_key, reset_key = jax.random.split(key)
+        normal = jax.random.normal(noise_key, (steps, NOISY, environments))
+        keys = jax.random.split(reset_key, (steps, environments))
+        batch = jax.vmap(one_step, in_axes=-1, out_axes=-1)
+        return jax.lax.scan(lambda carry, now: batch(carry, *now), episodes, (normal, keys))[1].mean()
+
+    return environments * steps / _fastest(lambda: fly(episodes, jnp.asarray(jax.random.key(1))))

@@ -1,0 +1,250 @@
+"""Proximal policy optimisation (Schulman et al. 2017), the paper's algorithm (R16 to R18), read from top to bottom.
+
+Details follow Stable-Baselines3 2.x where the paper is silent: diagonal Gaussian with a standard deviation that does
+not depend on the state, advantages normalised per minibatch, gradients clipped by their global norm. What an episode
+would still have earned counts where its horizon cut it off, and nothing comes after a failure (Pardo et al. 2018).
+One update, rollout and twelve epochs, is one compiled function.
+"""
+
+import math
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import optax
+from jaxtyping import Array, Float
+
+from flytune import env
+from flytune.control.policy import Network, Policy, make_network
+from flytune.env import Episode
+from flytune.learn.account import account
+from flytune.learn.optimise import averaged, descend
+from flytune.pytree import pytree
+from flytune.task.observation import NOISY, SIZE
+from flytune.task.task import Task
+from flytune.task.training import PpoSettings
+
+
+@pytree
+class Parameters:
+    """What the gradient changes."""
+
+    actor: Network  # 17 -> mean of the action
+    critic: Network  # 17 -> value
+    log_std: Float[Array, "4"]
+
+
+@pytree
+class Learner:
+    """Everything an update needs and changes."""
+
+    parameters: Parameters
+    average: Network  # exponential moving average of the actor over updates; the one that is flown
+    optimiser: Any
+    episodes: Episode  # a batch, along the last axis
+    key: Array
+    updates: Array
+
+
+@pytree
+class Batch:
+    """Samples of a rollout, along the first axis or axes."""
+
+    observation: Float[Array, "*batch 17"]
+    action: Float[Array, "*batch 4"]  # as drawn, before clipping
+    log_probability: Float[Array, "*batch"]
+    advantage: Float[Array, "*batch"]
+    target: Float[Array, "*batch"]  # advantage + value: what the critic should have said
+
+
+def policy(settings: PpoSettings, learner: Learner) -> Policy:
+    """The policy that is flown: the averaged actor's mean action."""
+    return Policy(actor=learner.average, input_scale=jnp.ones(SIZE), squash="clip")
+
+
+def last_policy(settings: PpoSettings, learner: Learner) -> Policy:
+    """The policy of the last update, the paper's as printed."""
+    return Policy(actor=learner.parameters.actor, input_scale=jnp.ones(SIZE), squash="clip")
+
+
+@partial(jax.jit, static_argnames="settings")
+def start(task: Task, settings: PpoSettings, key: Array) -> Learner:
+    """A learner before its first update."""
+    actor_key, critic_key, episode_key, key = jax.random.split(key, 4)
+    parameters = Parameters(
+        actor=make_network(actor_key, (SIZE, *settings.hidden, 4), last_gain=0.01),
+        critic=make_network(critic_key, (SIZE, *settings.hidden, 1), last_gain=1.0),
+        log_std=jnp.full(4, settings.initial_log_std),
+    )
+    keys = jax.random.split(episode_key, settings.environments)
+    return Learner(
+        parameters=parameters,
+        average=parameters.actor,
+        optimiser=_optimiser(settings).init(parameters),  # pyright: ignore[reportArgumentType]
+        episodes=jax.vmap(partial(env.reset, task), out_axes=-1)(keys),
+        key=key,
+        updates=jnp.zeros((), jnp.int32),
+    )
+
+
+@partial(jax.jit, static_argnames="settings", donate_argnames="learner")
+def update(task: Task, settings: PpoSettings, learner: Learner) -> tuple[Learner, dict[str, Any]]:
+    """The learner after one update, and what it saw."""
+    key, rollout_key, shuffle_key = jax.random.split(learner.key, 3)
+    episodes, batch, seen = rollout(task, settings, learner.parameters, learner.episodes, rollout_key)
+    flat = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), batch)
+    parameters, optimiser, losses = learn(settings, learner.parameters, learner.optimiser, flat, shuffle_key)
+    after = Learner(
+        parameters=parameters,
+        average=averaged(learner.average, parameters.actor, settings.average, learner.updates),
+        optimiser=optimiser,
+        episodes=episodes,
+        key=key,
+        updates=learner.updates + 1,
+    )
+    spread = jnp.var(flat.target)
+    explained = 1 - jnp.var(flat.advantage) / jnp.where(spread > 0, spread, 1.0)
+    return after, {**seen, **losses, "std": jnp.mean(jnp.exp(parameters.log_std)), "explained_variance": explained}
+
+
+def rollout(
+    task: Task, settings: PpoSettings, parameters: Parameters, episodes: Episode, key: Array
+) -> tuple[Episode, Batch, dict[str, Any]]:
+    """The episodes after `settings.rollout` steps, the samples [time, environment, ...] of the way, and its account."""
+    noise_key, action_key, reset_key = jax.random.split(key, 3)
+    steps, width = settings.rollout, settings.environments
+    noise = jax.random.normal(noise_key, (steps + 1, NOISY, width))
+    draws = jax.random.normal(action_key, (steps, width, 4))
+    reset_keys = jax.random.split(reset_key, (steps, width))
+    look = jax.vmap(partial(env.look, task), in_axes=-1, out_axes=0)
+
+    def advance(episodes: Episode, now: Any) -> Any:
+        noise_now, noise_next, draw, reset_keys = now
+        seen = look(episodes, noise_now)
+        mean = parameters.actor(seen)
+        action = mean + jnp.exp(parameters.log_std) * draw
+        moved, outcome = jax.vmap(partial(env.step, task), in_axes=(-1, 0), out_axes=-1)(episodes, action)
+        following = look(moved, noise_next)  # before a reset: what a truncated episode would have gone on from
+        after = jax.vmap(partial(env.autoreset, task), in_axes=(-1, -1, 0), out_axes=-1)(moved, outcome, reset_keys)
+        return after, (seen, mean, action, following, outcome, moved)
+
+    episodes, (seen, mean, action, following, outcome, moved) = jax.lax.scan(
+        advance, episodes, (noise[:-1], noise[1:], draws, reset_keys)
+    )
+    value, next_value = parameters.critic(seen)[..., 0], parameters.critic(following)[..., 0]
+    advantage = advantages(
+        outcome.reward,
+        value,
+        next_value,
+        outcome.terminated,
+        outcome.terminated | outcome.truncated,
+        settings.discount,
+        settings.gae_lambda,
+    )
+    batch = Batch(
+        observation=seen,
+        action=action,
+        log_probability=log_probability(mean, parameters.log_std, action),
+        advantage=advantage,
+        target=advantage + value,
+    )
+    return episodes, batch, account(task, outcome, moved)
+
+
+def advantages(
+    reward: Float[Array, "time *batch"],
+    value: Float[Array, "time *batch"],
+    next_value: Float[Array, "time *batch"],
+    terminated: Array,
+    ended: Array,
+    discount: float,
+    gae_lambda: float,
+) -> Float[Array, "time *batch"]:
+    """Generalised advantage estimates.
+
+        delta_t = r_t + discount * V(s_{t+1}) * (not terminated) - V(s_t)
+        A_t     = delta_t + discount * lambda * (not ended) * A_{t+1}
+
+    `next_value` is the value of the state an action led to, before any reset, so that truncation bootstraps and
+    termination does not.
+
+    Source: Schulman et al. 2016, equation 16; Pardo et al. 2018.
+    """
+    delta = reward + discount * next_value * ~terminated - value
+
+    def back(later: Array, now: tuple[Array, Array]) -> tuple[Array, Array]:
+        delta, ended = now
+        here = delta + discount * gae_lambda * ~ended * later
+        return here, here
+
+    return jax.lax.scan(back, jnp.zeros_like(delta[0]), (delta, ended), reverse=True)[1]
+
+
+def log_probability(
+    mean: Float[Array, "*batch 4"], log_std: Float[Array, "4"], action: Float[Array, "*batch 4"]
+) -> Float[Array, "*batch"]:
+    """The log density of actions under a diagonal Gaussian."""
+    squared = ((action - mean) * jnp.exp(-log_std)) ** 2
+    return -0.5 * jnp.sum(squared, axis=-1) - jnp.sum(log_std) - 0.5 * 4 * math.log(2 * math.pi)
+
+
+def learn(
+    settings: PpoSettings, parameters: Parameters, optimiser: Any, batch: Batch, key: Array
+) -> tuple[Parameters, Any, dict[str, Array]]:
+    """Parameters and optimiser after all epochs over the samples [S, ...], and the mean losses of the last epoch."""
+    samples = batch.action.shape[0]
+    # one matrix, so that shuffling is one gather
+    columns = jnp.concatenate(
+        [
+            batch.observation,
+            batch.action,
+            jnp.stack([batch.log_probability, batch.advantage, batch.target], axis=-1),
+        ],
+        axis=-1,
+    )
+
+    def epoch(carry: Any, key: Array) -> Any:
+        shuffled = columns[jax.random.permutation(key, samples)]
+        return jax.lax.scan(minibatch, carry, shuffled.reshape(-1, settings.minibatch, columns.shape[-1]))
+
+    def minibatch(carry: Any, rows: Array) -> Any:
+        parameters, optimiser = carry
+        part = Batch(
+            observation=rows[:, :SIZE],
+            action=rows[:, SIZE : SIZE + 4],
+            log_probability=rows[:, SIZE + 4],
+            advantage=rows[:, SIZE + 5],
+            target=rows[:, SIZE + 6],
+        )
+        gradient, losses = jax.grad(loss, argnums=1, has_aux=True)(settings, parameters, part)
+        return descend(_optimiser(settings), gradient, optimiser, parameters), losses
+
+    keys = jax.random.split(key, settings.epochs)
+    (parameters, optimiser), losses = jax.lax.scan(epoch, (parameters, optimiser), keys)
+    return parameters, optimiser, {name: jnp.mean(values[-1]) for name, values in losses.items()}
+
+
+def loss(settings: PpoSettings, parameters: Parameters, batch: Batch) -> tuple[Array, dict[str, Array]]:
+    """The clipped surrogate, value and entropy loss of one minibatch, and its parts. Source: Schulman et al. 2017."""
+    advantage = batch.advantage
+    advantage = (advantage - jnp.mean(advantage)) / (jnp.std(advantage, ddof=1) + 1e-8)
+    logarithm = log_probability(parameters.actor(batch.observation), parameters.log_std, batch.action)
+    ratio = jnp.exp(logarithm - batch.log_probability)
+    clipped = jnp.clip(ratio, 1 - settings.clip, 1 + settings.clip)
+    policy_loss = -jnp.mean(jnp.minimum(ratio * advantage, clipped * advantage))
+    value_loss = jnp.mean((parameters.critic(batch.observation)[..., 0] - batch.target) ** 2)
+    entropy = jnp.sum(parameters.log_std) + 0.5 * 4 * math.log(2 * math.pi * math.e)
+    total = policy_loss + settings.value_weight * value_loss - settings.entropy_weight * entropy
+    parts = {
+        "loss": total,
+        "policy_loss": policy_loss,
+        "value_loss": value_loss,
+        "clip_fraction": jnp.mean(jnp.abs(ratio - 1) > settings.clip),
+        "approximate_kl": jnp.mean(ratio - 1 - (logarithm - batch.log_probability)),
+    }
+    return total, parts
+
+
+def _optimiser(settings: PpoSettings) -> optax.GradientTransformation:
+    return optax.chain(optax.clip_by_global_norm(settings.gradient_norm), optax.adam(settings.learning_rate, eps=1e-5))

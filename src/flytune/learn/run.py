@@ -1,0 +1,259 @@
+"""Training: the loop over updates, what it writes down, and how it is interrupted and resumed."""
+
+import contextlib
+import dataclasses
+import math
+import signal
+import threading
+import time
+from collections.abc import Callable, Iterator
+from importlib import metadata
+from pathlib import Path
+from types import ModuleType
+from typing import Any, Literal
+
+import jax
+import numpy as np
+
+from flytune.control.policy import Policy
+from flytune.errors import BadInput, Diverged, Interrupted
+from flytune.learn import apg, ppo
+from flytune.learn.directory import RunDirectory
+from flytune.task.task import Task, write_task
+from flytune.task.termination import causes
+
+Trainer = Literal["apg", "ppo"]
+TRAINERS: dict[str, ModuleType] = {"apg": apg, "ppo": ppo}
+CHECKPOINT_INTERVAL = 30.0  # s between checkpoints
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Run:
+    """A training that has ended, or what its directory says of it."""
+
+    task: Task
+    trainer: str
+    seed: int
+    policy: Policy  # the one that is flown: weights averaged over updates
+    last_policy: Policy  # the weights of the last update
+    metrics: list[dict[str, Any]]  # one row per update, as in metrics.jsonl
+    directory: Path | None
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Progress:
+    """How far a training is."""
+
+    label: str  # task, trainer and seed
+    update: int
+    updates: int
+    steps: int
+    steps_per_second: float
+    seconds_left: float
+    reward: float  # mean per step
+
+
+def train(
+    task: Task,
+    trainer: Trainer = "apg",
+    *,
+    seed: int = 0,
+    out: Path | None = None,
+    resume: bool = False,
+    on_progress: Callable[[Progress], None] | None = None,
+) -> Run:
+    """A policy trained for a task, and the way there.
+
+    Same task, trainer, seed and machine give the same policy bit by bit, also across an interruption, where XLA runs
+    single-threaded (XLA_FLAGS="--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1"; the command line
+    sets this).
+
+    Args:
+        task: what to learn; `task.apg` or `task.ppo` say how.
+        trainer: `apg` or `ppo`.
+        seed: of the weights, the episodes and the noise; 0 or more.
+        out: run directory to write; nothing is written where None.
+        resume: go on from the checkpoint in `out`.
+        on_progress: called after every update.
+
+    Raises:
+        BadInput: an argument that cannot be used; nothing was written.
+        Diverged: numbers stopped being finite.
+        Interrupted: Ctrl-C; a checkpoint was saved in `out`.
+    """
+    if trainer not in TRAINERS:
+        raise BadInput(f"trainer: {trainer!r} is not allowed. Allowed: {', '.join(TRAINERS)}.")
+    if not 0 <= seed < 2**32:
+        raise BadInput(f"seed: {seed} is not allowed. Allowed: a whole number, 0 to {2**32 - 1}.")
+    settings = getattr(task, trainer)
+    teacher = TRAINERS[trainer]
+    rows: list[dict[str, Any]] = []
+    with _deferred_interrupt() as interrupted:
+        directory = RunDirectory(out, task, trainer, seed, resume) if out is not None else None
+        learner = teacher.start(task, settings, jax.random.key(seed))
+        if directory is not None and resume:
+            learner, rows = directory.resume(learner)
+        clock = _Clock(task, trainer, seed, rows)
+        learner = _loop(teacher, task, settings, learner, rows, clock, directory, interrupted, on_progress)
+    about = _about(task, trainer, seed, rows)
+    run = Run(
+        task=task,
+        trainer=trainer,
+        seed=seed,
+        policy=dataclasses.replace(teacher.policy(settings, learner), about=about),
+        last_policy=dataclasses.replace(teacher.last_policy(settings, learner), about=about),
+        metrics=rows,
+        directory=out,
+    )
+    if directory is not None:
+        directory.finish(run.policy, run.last_policy, rows[-1])
+    return run
+
+
+def total_updates(task: Task, trainer: str) -> int:
+    """How many updates a training takes."""
+    if trainer == "apg":
+        return task.apg.updates
+    return math.ceil(task.ppo.steps / steps_per_update(task, trainer))
+
+
+def steps_per_update(task: Task, trainer: str) -> int:
+    """How many environment steps one update takes."""
+    if trainer == "apg":
+        return task.apg.environments * task.apg.window
+    return task.ppo.environments * task.ppo.rollout
+
+
+def with_steps(task: Task, trainer: str, steps: int) -> Task:
+    """The task with its trainer set to stop after about `steps` environment steps, rounded up to whole updates."""
+    if steps < 1:
+        raise BadInput(f"steps: {steps} is not allowed. Allowed: a whole number, 1 or more environment steps.")
+    if trainer == "apg":
+        updates = math.ceil(steps / steps_per_update(task, trainer))
+        return dataclasses.replace(task, apg=dataclasses.replace(task.apg, updates=updates))
+    return dataclasses.replace(task, ppo=dataclasses.replace(task.ppo, steps=steps))
+
+
+class _Clock:
+    """Time and speed of a training; the first update compiles, so speed is judged by the others."""
+
+    def __init__(self, task: Task, trainer: str, seed: int, rows: list[dict[str, Any]]) -> None:
+        self.label = f"{task.name}  {trainer}  seed {seed}"
+        self.updates, self.samples = total_updates(task, trainer), steps_per_update(task, trainer)
+        self.first, self.before = len(rows), rows[-1]["seconds"] if rows else 0.0
+        self.started = self.compiled = time.monotonic()
+
+    def seconds(self, number: int) -> float:
+        """Seconds of training up to the end of update `number`, which is now."""
+        if number == self.first + 1:
+            self.compiled = time.monotonic()
+        return self.before + time.monotonic() - self.started
+
+    def progress(self, number: int, reward: float) -> Progress:
+        """How far the training is after update `number`."""
+        since = self.compiled if number > self.first + 1 else self.started
+        counted = max(number - self.first - 1, 1)
+        rate = counted * self.samples / max(time.monotonic() - since, 1e-9)
+        return Progress(
+            label=self.label,
+            update=number,
+            updates=self.updates,
+            steps=number * self.samples,
+            steps_per_second=rate,
+            seconds_left=(self.updates - number) * self.samples / rate,
+            reward=reward,
+        )
+
+
+def _loop(
+    teacher: ModuleType,
+    task: Task,
+    settings: Any,
+    learner: Any,
+    rows: list[dict[str, Any]],
+    clock: _Clock,
+    directory: RunDirectory | None,
+    interrupted: threading.Event,
+    on_progress: Callable[[Progress], None] | None,
+) -> Any:
+    """The learner after all updates; `rows` grows by one per update."""
+    names, saved = causes(task.termination), time.monotonic()
+    for number in range(len(rows) + 1, clock.updates + 1):
+        learner, seen = teacher.update(task, settings, learner)
+        jax.block_until_ready(seen)
+        row = _row(seen, names, number, number * clock.samples, clock.seconds(number))
+        _check_finite(row)
+        rows.append(row)
+        if on_progress is not None:
+            on_progress(clock.progress(number, row["reward"]))
+        if directory is not None and (interrupted.is_set() or time.monotonic() - saved > CHECKPOINT_INTERVAL):
+            directory.checkpoint(learner, rows)
+            saved = time.monotonic()
+        if interrupted.is_set():
+            if directory is None:
+                raise KeyboardInterrupt
+            raise Interrupted(
+                f"interrupted after {row['steps']} environment steps; checkpoint saved in "
+                f"{directory.path / 'checkpoint'}. Go on with --out {directory.path} --resume"
+            )
+    if directory is not None:
+        directory.checkpoint(learner, rows)
+    return learner
+
+
+@contextlib.contextmanager
+def _deferred_interrupt() -> Iterator[threading.Event]:
+    """An event that Ctrl-C sets, so that it never falls into the middle of an update; a second Ctrl-C acts at once."""
+    event = threading.Event()
+    if threading.current_thread() is not threading.main_thread():
+        yield event
+        return
+    usual = signal.getsignal(signal.SIGINT)
+
+    def once(number: int, frame: object) -> None:
+        event.set()
+        signal.signal(signal.SIGINT, usual)
+
+    signal.signal(signal.SIGINT, once)
+    try:
+        yield event
+    finally:
+        signal.signal(signal.SIGINT, usual)
+
+
+def _row(seen: dict[str, Any], names: list[str], update: int, steps: int, seconds: float) -> dict[str, Any]:
+    values = jax.tree.map(np.asarray, seen)
+
+    def number(value: np.ndarray) -> float | None:
+        return float(value) if np.isfinite(value) else None
+
+    row: dict[str, Any] = {"update": update, "steps": steps, "seconds": round(seconds, 3)}
+    row["episode_reward"] = number(values.pop("episode_reward"))
+    row["reward"] = float(values.pop("reward"))
+    row["terms"] = {name: float(value) for name, value in values.pop("terms").items()}
+    row["terminations"] = dict(zip(names, map(int, values.pop("terminations")), strict=True))
+    row["episodes"] = int(values.pop("episodes"))
+    row["episode_length"] = number(values.pop("episode_length"))
+    row |= {name: float(value) for name, value in sorted(values.items())}
+    return row
+
+
+def _check_finite(row: dict[str, Any]) -> None:
+    for name, value in row.items():
+        if isinstance(value, float) and not math.isfinite(value):
+            raise Diverged(
+                f"training: {name} is {value} in update {row['update']} ({row['steps']} environment steps). "
+                "A smaller learning_rate, or smaller weights in the reward, may help."
+            )
+
+
+def _about(task: Task, trainer: str, seed: int, rows: list[dict[str, Any]]) -> dict[str, Any]:
+    return {
+        "task": task.name,
+        "vehicle": task.vehicle.name,
+        "task_toml": write_task(task),
+        "trainer": trainer,
+        "seed": seed,
+        "steps": rows[-1]["steps"] if rows else 0,
+        "version": metadata.version("flytune"),
+    }

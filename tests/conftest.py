@@ -1,0 +1,26 @@
+"""What every test shares: a single-threaded XLA, a compilation cache, and types that are checked while tests run."""
+
+import os
+import sys
+from pathlib import Path
+from types import ModuleType
+
+os.environ.setdefault("XLA_FLAGS", "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1")
+os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(Path(__file__).parents[1] / ".jax_cache"))
+os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.3")
+
+from beartype import beartype
+from jaxtyping import install_import_hook
+
+# without physics.vehicle, whose properties promise a float and give a tracer in compiled code
+CHECKED = ["control", "document", "env", "learn", "physics.dynamics", "physics.rotation", "response", "show", "task"]
+
+
+def check_functions(function):
+    """Beartype on a function, but not on a constructor: JAX rebuilds our dataclasses with tracers in their numbers."""
+    return function if function.__name__ == "__init__" else beartype(function)
+
+
+sys.modules["flytune_type_checker"] = checker = ModuleType("flytune_type_checker")
+checker.check_functions = check_functions
+install_import_hook([f"flytune.{name}" for name in CHECKED], "flytune_type_checker.check_functions")
