@@ -2,7 +2,6 @@
 
 import itertools
 import json
-import struct
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Literal
@@ -19,6 +18,11 @@ from flytune.pytree import label, pytree, static
 from flytune.task import observation
 
 FORMAT = "flytune-policy-1"
+HEADER = "flytune"  # one entry: safetensors writes several in an order that changes from process to process
+ACTION = (
+    "4 motors [-1, 1]: rotor speed = hover speed * (1 + action_scale * action); "
+    "0 (+x, -y), 1 (-x, -y), 2 (-x, +y), 3 (+x, +y)"
+)
 
 
 @pytree
@@ -78,7 +82,7 @@ class Policy:
 
 
 def save_policy(path: Path, policy: Policy) -> None:
-    """Write a policy as safetensors; its header carries the observation, the action and what `about` says."""
+    """Write a policy as safetensors; its header carries the observation, the action and what `about` says, as JSON."""
     tensors = {"input_scale": np.asarray(policy.input_scale)}
     for index, (weight, bias) in enumerate(zip(policy.actor.weights, policy.actor.biases, strict=True)):
         tensors[f"actor.{index}.weight"] = np.asarray(weight)
@@ -87,13 +91,12 @@ def save_policy(path: Path, policy: Policy) -> None:
         "format": FORMAT,
         "squash": policy.squash,
         "observation": observation.LAYOUT,
-        "action": "4 motors [-1, 1]: rotor speed = hover speed * (1 + action_scale * action); "
-        "0 (+x, -y), 1 (-x, -y), 2 (-x, +y), 3 (+x, +y)",
+        "action": ACTION,
         "rate": "100 Hz",
-        "about": json.dumps(policy.about, sort_keys=True),
+        "about": policy.about,
     }
     whole = path.with_name(path.name + ".part")
-    safetensors.numpy.save_file(tensors, whole, metadata=header)
+    safetensors.numpy.save_file(tensors, whole, metadata={HEADER: json.dumps(header, sort_keys=True)})
     whole.replace(path)
 
 
@@ -105,14 +108,15 @@ def load_policy(path: Path) -> Policy:
     """
     try:
         with safetensors.safe_open(path, framework="numpy") as file:
-            header = file.metadata() or {}
+            header = json.loads((file.metadata() or {}).get(HEADER, "{}"))
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118  (not a dict)
     except FileNotFoundError:
         raise BadInput(f"{path}: no such file. Give a run directory or a .safetensors policy.") from None
-    except (safetensors.SafetensorError, OSError, struct.error) as error:
+    except (safetensors.SafetensorError, OSError, ValueError) as error:
         raise BadInput(f"{path}: is not a policy ({error}). Give a .safetensors file written by flytune.") from None
-    if header.get("format") != FORMAT:
-        raise BadInput(f"{path}: is not a flytune policy (format {header.get('format')!r}). Allowed: {FORMAT}.")
+    if not isinstance(header, dict) or header.get("format") != FORMAT:
+        found = header.get("format") if isinstance(header, dict) else None
+        raise BadInput(f"{path}: is not a flytune policy (format {found!r}). Allowed: {FORMAT}.")
     if header.get("observation") != observation.LAYOUT:
         raise BadInput(
             f"{path}: was trained on another observation, {header.get('observation')!r}. "
@@ -121,7 +125,7 @@ def load_policy(path: Path) -> Policy:
     return _assemble(path, header, tensors)
 
 
-def _assemble(path: Path, header: dict[str, str], tensors: dict[str, np.ndarray]) -> Policy:
+def _assemble(path: Path, header: dict[str, Any], tensors: dict[str, np.ndarray]) -> Policy:
     layers = (len(tensors) - 1) // 2
     names = {"input_scale", *(f"actor.{i}.{part}" for i in range(layers) for part in ("weight", "bias"))}
     if layers < 1 or set(tensors) != names or header.get("squash") not in ("clip", "tanh"):
@@ -143,6 +147,6 @@ def _assemble(path: Path, header: dict[str, str], tensors: dict[str, np.ndarray]
             biases=tuple(jnp.asarray(tensors[f"actor.{i}.bias"]) for i in range(layers)),
         ),
         input_scale=jnp.asarray(tensors["input_scale"]),
-        squash=header["squash"],  # pyright: ignore[reportArgumentType]  (checked above)
-        about=json.loads(header.get("about", "{}")),
+        squash=header["squash"],
+        about=header.get("about", {}),
     )

@@ -91,7 +91,7 @@ def update(task: Task, settings: ApgSettings, learner: Learner) -> tuple[Learner
         task, settings, learner.actor, learner.episodes, flight_key
     )
     actor, optimiser = descend(_optimiser(settings), gradient, learner.optimiser, learner.actor)
-    seen["gradient_norm"] = optax.global_norm(gradient)
+    seen["gradient_norm"] = optax.tree.norm(gradient)
     after = Learner(
         actor=actor,
         average=averaged(learner.average, actor, settings.average, learner.updates),

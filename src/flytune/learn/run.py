@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator
 from importlib import metadata
 from pathlib import Path
 from types import ModuleType
-from typing import Any, Literal
+from typing import Any
 
 import jax
 import numpy as np
@@ -22,7 +22,6 @@ from flytune.learn.directory import RunDirectory
 from flytune.task.task import Task, write_task
 from flytune.task.termination import causes
 
-Trainer = Literal["apg", "ppo"]
 TRAINERS: dict[str, ModuleType] = {"apg": apg, "ppo": ppo}
 CHECKPOINT_INTERVAL = 30.0  # s between checkpoints
 
@@ -55,7 +54,7 @@ class Progress:
 
 def train(
     task: Task,
-    trainer: Trainer = "apg",
+    trainer: str = "apg",
     *,
     seed: int = 0,
     out: Path | None = None,

@@ -58,7 +58,8 @@ def _stack(panels: Sequence[tuple[str, list[go.Scatter]]]) -> go.Figure:
         for line in lines:
             figure.add_trace(line.update(legend=legend, showlegend=title != "reward per episode"), row=row, col=1)
         top = 1 - (row - 1) * (1 + gap) / number
-        legends[legend] = {"orientation": "v", "x": 1.01, "xanchor": "left", "y": top, "yanchor": "top"}
+        place = {"x": 1.01, "xanchor": "left", "y": top, "yref": "paper", "yanchor": "top"}
+        legends[legend] = {"orientation": "v", **place}
         figure.update_yaxes(title_text="reward [1]" if "reward" in title else "episodes [1]", row=row, col=1)
     figure.update_xaxes(hoverformat=",.3s")
     figure.update_xaxes(title_text="environment steps [1]", row=number, col=1)
@@ -97,7 +98,7 @@ def _float(value: float | int | None) -> float:
     return np.nan if value is None else float(value)
 
 
-def _thin(values: Course) -> Course:
+def _thin(values: Course) -> Float[np.ndarray, "points"]:
     """At most POINTS values, each the mean of neighbours; NaN only where all of them are."""
     size = max(1, -(-len(values) // POINTS))
     padded = np.append(values, np.full(-len(values) % size, np.nan)).reshape(-1, size)

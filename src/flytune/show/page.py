@@ -37,13 +37,16 @@ thead tr:first-child th:first-child { text-align: left; padding-left: 0; }
 thead tr + tr th { font-weight: 400; color: #52606d; text-align: right; }
 tbody th, tbody td { padding: 5px 10px; border-bottom: 1px solid #e4e7eb; text-align: right; white-space: nowrap; }
 tbody th { text-align: left; padding-left: 0; font-weight: 600; }
+table.dense { font-size: 0.87rem; }
+table.dense th, table.dense td { padding-left: 5px; padding-right: 5px; }
+table.dense tbody th { white-space: normal; overflow-wrap: anywhere; min-width: 9rem; padding-left: 0; }
 dl { display: grid; grid-template-columns: max-content 1fr; gap: 3px 20px; margin: 14px 0; font-size: 0.93rem; }
 dt { color: #52606d; }
 dd { margin: 0; overflow-wrap: anywhere; font-variant-numeric: tabular-nums; }
 figure { margin: 10px 0 6px; }
 figcaption { font-size: 0.93rem; max-width: 88ch; margin-top: 4px; }
 .figure { overflow-x: auto; overflow-y: hidden; }
-.figure > div { min-width: 720px; }
+.figure > div { min-width: 860px; }
 .empty { border-left: 3px solid #cbd2d9; padding: 6px 14px; }
 code, pre { font-family: ui-monospace, SFMono-Regular, Menlo, Consolas, 'DejaVu Sans Mono', monospace; }
 pre { font-size: 0.8rem; line-height: 1.5; background: #f7f8f9; border: 1px solid #e4e7eb; border-radius: 4px;
@@ -57,6 +60,9 @@ pre i { color: #7b8794; font-style: normal; }
 @media print {
   main { max-width: none; padding: 0; }
   nav { display: none; }
+  .figure, .wide { overflow: visible; }
+  .figure > div { zoom: 0.65; }  /* figures keep the width of the window they were drawn in; paper is narrower */
+  table, table.dense { font-size: 0.72rem; }
   pre { max-height: none; overflow: visible; white-space: pre-wrap; border: 0; padding: 0; font-size: 0.66rem; }
   figure, table, dl { break-inside: avoid; }
   h2, h3 { break-after: avoid; }

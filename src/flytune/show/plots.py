@@ -168,7 +168,7 @@ def spread(judgement: Judgement) -> go.Figure | str:
         figure.update_yaxes(title_text=unit, rangemode="tozero", col=column)
     if not drawn:
         return "Every trial crashed, so there is no settling time, overshoot or steady-state error to draw."
-    figure.update_xaxes(showgrid=False)
+    figure.update_xaxes(showgrid=False, tickangle=0, tickfont_size=11)
     return style.frame(figure, 430, showlegend=False, margin={"l": 66, "r": 14, "t": 40, "b": 56})
 
 
@@ -291,17 +291,17 @@ def flights_3d(flights: Flights) -> go.Figure:
     if len(behind):
         gaps = np.full((len(behind), 1, 3), np.nan)  # so that one trace holds many separate lines
         points = np.concatenate([behind, gaps], axis=1).reshape(-1, 3)
-        figure.add_trace(_path(points, style.OTHERS, 2, f"{len(behind)} more trials"))
+        figure.add_trace(_path(points, style.OTHERS, 2.0, f"{len(behind)} more trials"))
     for trial in range(shown):
         path = flights.position[trial, ::step]
-        figure.add_trace(_path(path, style.TRIALS[trial], 4, f"trial {trial + 1}", group=str(trial)))
+        figure.add_trace(_path(path, style.TRIALS[trial], 4.0, f"trial {trial + 1}", group=str(trial)))
         figure.add_trace(_mark(path[0], style.TRIALS[trial], "circle", f"start of trial {trial + 1}", str(trial)))
     figure.add_trace(_mark(flights.target_position, style.BOUND, "diamond", "target", "target", legend=True))
     axis = {"gridcolor": style.HAIRLINE, "zeroline": False, "showbackground": False, "linecolor": style.QUIET}
     scene: Mapping[str, Any] = {
         **{f"{name}axis": {**axis, "title": {"text": f"{name} [m]"}} for name in "xyz"},
         "aspectmode": "data",
-        "camera": {"eye": {"x": 1.35, "y": -1.55, "z": 0.8}, "center": {"x": 0, "y": 0, "z": -0.15}},
+        "camera": {"eye": {"x": 1.2, "y": -1.4, "z": 0.72}, "center": {"x": 0, "y": 0, "z": -0.24}},
     }
     return style.frame(figure, 560, scene=scene, margin={"l": 0, "r": 0, "t": 40, "b": 0})
 

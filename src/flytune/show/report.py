@@ -148,8 +148,8 @@ Missing are trials that did not settle (settling time), that crashed (all three)
 overshoot. A box that is a line at zero overshoot is a response that never passes its target.""",
     "margins": """
 How much of each bound of the task is left, over all trials, the tightest bound first. At the red line the bound is
-reached, below it training would have ended the episode. A margin that stays near the line is what holds the pilot
-back; one far above it (an altitude of several times its bound) could as well not be there.""",
+reached, below it training would have ended the episode. A margin that comes near the line belongs to a bound
+that holds the pilot back; a bound whose margin stays far above it does not shape the flight.""",
     "space": """
 Turn it by dragging. Dots are starts, the red diamond is the target. Look for detours, and for flights that come in
 from one side only.""",

@@ -55,8 +55,8 @@ def response_table(judgement: Judgement) -> str:
                 number(row["settling_time"]["median"], 2),
                 number(row["settling_time"]["p95"], 2),
                 number(rise["median"], 2) if rise else "",
-                number(over["median"], 1, 100),
-                number(over["p95"], 1, 100),
+                number(over["median"], 1, 100.0),
+                number(over["p95"], 1, 100.0),
                 number(error["median"], digits, scale),
                 number(error["p95"], digits, scale),
                 unit,
@@ -116,7 +116,7 @@ def comparison_table(judged: Sequence[tuple[str, str, Judgement]]) -> str:
                 str(told["crashed"]),
             )
         )
-    return _table(head, rows)
+    return _table(head, rows, "dense")
 
 
 def differences_table(tasks: Sequence[tuple[str, Task]]) -> str:
@@ -164,9 +164,9 @@ def number(value: float | None, decimals: int, scale: float = 1.0) -> str:
     return DASH if value is None else f"{value * scale:.{decimals}f}"
 
 
-def _table(head: str, rows: Sequence[Row]) -> str:
+def _table(head: str, rows: Sequence[Row], kind: str = "plain") -> str:
     """A table whose first column heads its rows; cells are HTML."""
     body = "".join(
         f'<tr><th scope="row">{row[0]}</th>' + "".join(f"<td>{cell}</td>" for cell in row[1:]) + "</tr>" for row in rows
     )
-    return f'<div class="wide"><table><thead>{head}</thead><tbody>{body}</tbody></table></div>'
+    return f'<div class="wide"><table class="{kind}"><thead>{head}</thead><tbody>{body}</tbody></table></div>'

@@ -1,0 +1,77 @@
+"""Analytic policy gradient: the gradient is the true one, and following it flies."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from flytune.learn import apg
+from flytune.response.fly import fly
+from flytune.response.judge import judge
+from flytune.task.task import load_task
+
+
+@pytest.fixture(scope="module")
+def learner(small_task):
+    return apg.start(small_task, small_task.apg, jax.random.key(0))
+
+
+def test_the_gradient_agrees_with_finite_differences_of_the_flown_reward(small_task, learner):
+    def cost(actor):
+        return apg._loss(small_task, small_task.apg, actor, learner.episodes, jax.random.key(1))[0]
+
+    value, gradient = jax.jit(jax.value_and_grad(cost))(learner.actor)
+    jitted = jax.jit(cost)
+    assert np.isfinite(value)
+    # along the gradient itself the directional derivative is its squared norm
+    squared = sum(float(jnp.sum(leaf**2)) for leaf in jax.tree.leaves(gradient))
+    size = 1e-2 / squared**0.5
+    ahead = jax.tree.map(lambda w, g: w + size * g, learner.actor, gradient)
+    behind = jax.tree.map(lambda w, g: w - size * g, learner.actor, gradient)
+    measured = (float(jitted(ahead)) - float(jitted(behind))) / (2 * size)
+    assert measured == pytest.approx(squared, rel=0.03)
+
+
+def test_the_barrier_costs_nothing_inside_its_margin_and_grows_as_a_square_beyond(small_task):
+    settings = dataclasses.replace(small_task.apg, barrier_weight=30.0, barrier_margin=0.1)
+    costs = [float(apg.barrier(jnp.asarray(margin), settings)) for margin in (0.5, 0.1, 0.0, -0.1)]
+    # 30 * 0.1^2 = 0.3 at the bound, 30 * 0.2^2 = 1.2 as far beyond
+    np.testing.assert_allclose(costs, [0.0, 0.0, 0.3, 1.2], atol=1e-6)
+
+
+def test_each_block_of_the_observation_has_its_own_scale(small_task):
+    settings = dataclasses.replace(small_task.apg, input_scale=(1.0, 2.0, 3.0, 4.0, 5.0))
+    np.testing.assert_array_equal(apg.input_scale(settings), [1] * 3 + [2] * 4 + [3] * 3 + [4] * 3 + [5] * 4)
+
+
+def test_episodes_go_on_from_update_to_update(small_task):
+    learner = apg.start(small_task, small_task.apg, jax.random.key(0))
+    learner, _ = apg.update(small_task, small_task.apg, learner)
+    learner, _ = apg.update(small_task, small_task.apg, learner)
+    assert int(jnp.max(learner.episodes.steps)) == 2 * small_task.apg.window
+
+
+def test_the_average_is_the_mean_of_the_first_weights(small_task):
+    learner = apg.start(small_task, small_task.apg, jax.random.key(0))
+    seen = []
+    for _ in range(3):
+        learner, _ = apg.update(small_task, small_task.apg, learner)
+        seen.append(np.asarray(learner.actor.weights[0]))
+    np.testing.assert_allclose(learner.average.weights[0], np.mean(seen, axis=0), atol=1e-6)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("vehicle", ["crazyflie", "crazyflie-measured"])
+def test_apg_hovers_with_every_trial_settled_on_every_axis(vehicle):
+    task = load_task("baseline", {"vehicle": vehicle})
+    learner = apg.start(task, task.apg, jax.random.key(0))
+    for _ in range(task.apg.updates):
+        learner, _ = apg.update(task, task.apg, learner)
+    judgement = judge(fly(apg.policy(task.apg, learner), task))
+    wanted = 99 if vehicle == "crazyflie" else 95
+    assert {axis: judgement.settled(axis) >= wanted for axis in ("x", "y", "z", "yaw")} == dict.fromkeys(
+        ("x", "y", "z", "yaw"), True
+    )
+    assert not judgement.crashed.any()
