@@ -56,7 +56,9 @@ def test_help_explains_itself_without_importing_jax(folder):
 
 @pytest.mark.parametrize("command", ["train", "evaluate", "report", "show", "bench"])
 def test_each_command_explains_its_options(folder, command):
-    assert "usage: flytune " + command in flytune(command, "--help", cwd=folder).stdout.replace("__main__.py", "flytune")
+    assert "usage: flytune " + command in flytune(command, "--help", cwd=folder).stdout.replace(
+        "__main__.py", "flytune"
+    )
 
 
 def test_a_second_training_without_out_gets_a_number_of_its_own(folder, run):
@@ -209,7 +211,9 @@ def test_ctrl_c_saves_a_checkpoint_exits_with_130_and_resumes_to_the_same_policy
     assert not (folder / "cut" / "policy.safetensors").exists()
     assert "has not ended" in flytune("evaluate", "cut", cwd=folder, expect=2).stderr
     flytune(*train, "--out", "cut", "--resume", cwd=folder)
-    assert (folder / "cut" / "policy.safetensors").read_bytes() == (folder / "whole" / "policy.safetensors").read_bytes()
+    assert (folder / "cut" / "policy.safetensors").read_bytes() == (
+        folder / "whole" / "policy.safetensors"
+    ).read_bytes()
 
 
 @pytest.mark.slow

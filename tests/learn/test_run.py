@@ -9,6 +9,7 @@ import pytest
 
 from flytune.control.policy import load_policy
 from flytune.errors import BadInput, Diverged
+from flytune.learn.run import TRAINERS as TEACHERS
 from flytune.learn.run import total_updates, train, with_steps
 from flytune.task.task import load_task, write_task
 
@@ -28,7 +29,14 @@ def assert_identical(first, second):
 def test_a_run_directory_holds_all_that_the_contract_names(small_task, tmp_path, trainer):
     run = train(small_task, trainer, seed=3, out=tmp_path / "run")
     names = {path.name for path in (tmp_path / "run").iterdir()}
-    assert names == {"task.toml", "run.json", "policy.safetensors", "policy-last.safetensors", "metrics.jsonl", "checkpoint"}
+    assert names == {
+        "task.toml",
+        "run.json",
+        "policy.safetensors",
+        "policy-last.safetensors",
+        "metrics.jsonl",
+        "checkpoint",
+    }
     assert write_task(load_task(tmp_path / "run" / "task.toml")) == write_task(small_task)
     facts = json.loads((tmp_path / "run" / "run.json").read_text())
     assert facts["finished"] and facts["seed"] == 3 and facts["trainer"] == trainer and facts["steps"] > 0
@@ -73,7 +81,11 @@ def test_resuming_with_another_task_seed_or_trainer_is_refused_and_changes_nothi
     train(small_task, "apg", seed=1, out=tmp_path / "run")
     before = {path: path.read_bytes() for path in (tmp_path / "run").rglob("*") if path.is_file()}
     other = dataclasses.replace(small_task, horizon=400)
-    for task, trainer, seed, word in [(other, "apg", 1, "horizon"), (small_task, "ppo", 1, "apg"), (small_task, "apg", 2, "seed 1")]:
+    for task, trainer, seed, word in [
+        (other, "apg", 1, "horizon"),
+        (small_task, "ppo", 1, "apg"),
+        (small_task, "apg", 2, "seed 1"),
+    ]:
         with pytest.raises(BadInput, match=word):
             train(task, trainer, seed=seed, out=tmp_path / "run", resume=True)
     assert {path: path.read_bytes() for path in (tmp_path / "run").rglob("*") if path.is_file()} == before
@@ -115,3 +127,14 @@ def test_unknown_trainers_and_impossible_seeds_are_refused(small_task):
         train(small_task, "sarsa")
     with pytest.raises(BadInput, match="seed"):
         train(small_task, "apg", seed=-1)
+
+
+@pytest.mark.parametrize("trainer", TRAINERS)
+def test_an_update_gives_back_a_learner_of_the_types_it_took_so_that_it_compiles_only_once(small_task, trainer):
+    teacher, settings = TEACHERS[trainer], getattr(small_task, trainer)
+    before = jax.eval_shape(lambda key: teacher.start(small_task, settings, key), jax.random.key(0))
+    after, _ = jax.eval_shape(lambda learner: teacher.update(small_task, settings, learner), before)
+    kinds = [
+        [(leaf.shape, leaf.dtype, leaf.weak_type) for leaf in jax.tree.leaves(learner)] for learner in (before, after)
+    ]
+    assert kinds[0] == kinds[1]

@@ -75,7 +75,7 @@ def start(task: Task, settings: PpoSettings, key: Array) -> Learner:
     parameters = Parameters(
         actor=make_network(actor_key, (SIZE, *settings.hidden, 4), last_gain=0.01),
         critic=make_network(critic_key, (SIZE, *settings.hidden, 1), last_gain=1.0),
-        log_std=jnp.full(4, settings.initial_log_std),
+        log_std=jnp.full(4, settings.initial_log_std, float),
     )
     keys = jax.random.split(episode_key, settings.environments)
     return Learner(

@@ -35,7 +35,7 @@ def hovering(vehicle: Vehicle, position: Components, attitude: Components = (0.0
         attitude=tuple(jnp.asarray(part, float) for part in attitude),
         velocity=tuple(jnp.zeros(3)),
         body_rate=tuple(jnp.zeros(3)),
-        rotor_speed_rpm=tuple(jnp.full(4, vehicle.hover_rotor_speed_rpm)),
+        rotor_speed_rpm=tuple(jnp.full(4, vehicle.hover_rotor_speed_rpm, float)),
         pending_actions=jnp.zeros((vehicle.action_latency_steps, 4)),
     )
 

@@ -103,7 +103,7 @@ def _section(entry: Entry, anchor: str) -> str:
         "margins": page.drawing(plots.margins(entry.flights, entry.judgement), _CAPTIONS["margins"]),
         "space": page.drawing(plots.flights_3d(entry.flights), _CAPTIONS["space"]),
         "learning": _learning(entry),
-        "task": "<p>Every number this policy was trained with, its unit, what is allowed, and where it comes from.</p>"
+        "task": "<p>Every number of the task, its unit, what is allowed, and where it comes from.</p>"
         f"{tables.task_listing(entry.task)}",
         "about": tables.definitions(entry.about) if entry.about else '<p class="empty">Nothing is known of it.</p>',
     }
