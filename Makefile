@@ -38,7 +38,7 @@ check: .venv/dev.stamp
 
 PIN := $(BIN)/pip-compile --quiet --generate-hashes --allow-unsafe --strip-extras --no-header --no-annotate \
        --no-emit-index-url --no-emit-trusted-host --no-emit-find-links --no-emit-options
-pins: .venv/dev.stamp
+pins:
 	$(PIN) --extra build -o requirements/base.txt pyproject.toml
 	$(PIN) --extra build --extra dev -c requirements/base.txt -o requirements/dev.txt pyproject.toml
 

@@ -81,7 +81,7 @@ def test_clipping_takes_the_gradient_from_samples_that_have_moved_far_enough(sma
     fraction = ppo.loss(small_task.ppo, parameters, moved)[1]["clip_fraction"]
     assert float(fraction) == 1.0
     only_negative = dataclasses.replace(moved, action=jnp.where(negative[:, None], moved.action, 0.0))
-    # samples with a positive advantage give no gradient, whatever their action was, if their ratio stays beyond the clip
+    # a positive advantage beyond the clip gives no gradient, whatever the action was
     same = dataclasses.replace(
         only_negative,
         log_probability=jnp.where(
