@@ -9,8 +9,7 @@ export PIP_DISABLE_PIP_VERSION_CHECK = 1
 .PHONY: demo test test-slow check pins clean
 
 demo: .venv/base.stamp
-	run=$$($(BIN)/flytune train baseline | tail -n 1) && \
-	$(BIN)/flytune evaluate "$$run" && \
+	@run=$$($(BIN)/flytune train baseline | tail -n 1) && \
 	$(BIN)/flytune report "$$run" --out report.html && \
 	echo "open report.html in a browser"
 

@@ -110,7 +110,9 @@ def _add_evaluate(commands: Any) -> None:
 
 
 def _add_report(commands: Any) -> None:
-    command = _command(commands, "report", _report, "write one self-contained HTML page about one or more pilots")
+    command = _command(
+        commands, "report", _report, "print the tables of one or more pilots, and write one self-contained HTML page"
+    )
     command.add_argument("who", metavar="WHO", nargs="+", help=WHO_HELP)
     _add_trial_options(command)
     command.add_argument("--out", type=Path, default=Path("report.html"), metavar="FILE", help="the page")
@@ -175,12 +177,14 @@ def _report(options: argparse.Namespace) -> None:
     entries = []
     for pilot in [find_pilot(who) for who in options.who]:
         flights, task = _fly(pilot, options)
+        judgement = judge(flights)
+        print(judgement.table(), end="\n\n")
         entries.append(
             Entry(
                 name=pilot.name,
                 task=task,
                 flights=flights,
-                judgement=judge(flights),
+                judgement=judgement,
                 metrics=pilot.metrics,
                 about=pilot.about,
             )

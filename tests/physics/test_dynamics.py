@@ -161,11 +161,13 @@ def test_a_spin_without_torque_keeps_its_energy_and_its_angular_momentum(paper, 
 
 @pytest.mark.parametrize("name", vehicle_names())
 def test_no_action_hovers_for_ten_seconds(name, fly):
-    # float32 knows g to 6e-7 m/s^2; t^2 / 2 = 50 s^2 turns that into 0.03 mm, its sum over steps into less than 1 mm
+    # Hover is unstable. float32 knows the force of two motors to 2 * 0.081 N * 2^-24 = 1e-8 N, a residual torque of
+    # 2.8e-10 N m at the lever, 1.6e-5 rad/s^2; after t = 10 s: 1.6e-4 rad/s, and g 1.6e-5 t^4 / 24 = 0.07 m to the side.
     vehicle = load_vehicle(name)
     flown = fly(vehicle, state(vehicle), np.zeros((1000, 4)))
-    assert np.abs(flown.position[-1]).max() < 1e-3
-    assert np.abs(flown.body_rate[-1]).max() < 1e-5
+    assert np.abs(flown.position[-1, :2]).max() < 0.07
+    assert np.abs(flown.position[-1, 2]) < 1e-3
+    assert np.abs(flown.body_rate[-1]).max() < 1.6e-4
 
 
 @pytest.mark.parametrize("name", vehicle_names())
@@ -181,8 +183,9 @@ def test_drag_slows_a_level_flight_exponentially(paper, fly):
     slowed = dataclasses.replace(paper, drag=(0.0147, 0.0147, 0.0128))
     flown = fly(slowed, state(slowed, velocity=(2.0, -1.0, 0.0)), np.zeros((200, 4)))
     k, t = 0.0147 / 0.033, (np.arange(1, 201) / 100)[:, None]
-    np.testing.assert_allclose(flown.velocity[:, :2], [2.0, -1.0] * np.exp(-k * t), atol=1e-5)
-    np.testing.assert_allclose(flown.position[:, :2], [2.0, -1.0] * (1 - np.exp(-k * t)) / k, atol=2e-5)
+    # the residual torque of float32 (see the hover) costs up to g 1.6e-5 t^3 / 6 = 2e-4 m/s in 2 s
+    np.testing.assert_allclose(flown.velocity[:, :2], [2.0, -1.0] * np.exp(-k * t), atol=2e-4)
+    np.testing.assert_allclose(flown.position[:, :2], [2.0, -1.0] * (1 - np.exp(-k * t)) / k, atol=2e-4)
 
 
 def test_a_fall_through_drag_ends_at_the_terminal_speed(paper, fly):
@@ -223,9 +226,8 @@ def test_a_turned_world_gives_the_turned_flight(vehicle, request, fly):
 @pytest.mark.parametrize("vehicle", ["paper", "measured"])
 def test_a_mirrored_world_gives_the_mirrored_flight(vehicle, request, fly):
     # y -> -y: vectors turn their y round; rates, being axial, their x and z; (x, y, z, w) becomes (-x, y, -z, w).
-    # Motors 0 and 3, 1 and 2 change places, and every propeller turns the other way: km -> -km.
+    # Motors 0 and 3, 1 and 2 change places; they turn opposite ways, so the vehicle is its own mirror image.
     vehicle = request.getfixturevalue(vehicle)
-    mirrored = dataclasses.replace(vehicle, torque_coefficient=-vehicle.torque_coefficient)
     signs = {
         "position": np.array([1, -1, 1]),
         "attitude": np.array([-1, 1, -1, 1]),
@@ -234,8 +236,8 @@ def test_a_mirrored_world_gives_the_mirrored_flight(vehicle, request, fly):
     }
     actions = np.random.default_rng(3).uniform(-0.5, 0.5, (100, 4))
     here = fly(vehicle, state(vehicle, **TUMBLE), actions)
-    start = state(mirrored, **{name: signs[name] * np.array(part) for name, part in TUMBLE.items()})
-    there = fly(mirrored, start, actions[:, [3, 2, 1, 0]])
+    start = state(vehicle, **{name: signs[name] * np.array(part) for name, part in TUMBLE.items()})
+    there = fly(vehicle, start, actions[:, [3, 2, 1, 0]])
     for name, sign in signs.items():
         np.testing.assert_allclose(getattr(there, name), sign * getattr(here, name), atol=1e-4, err_msg=name)
 

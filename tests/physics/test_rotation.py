@@ -147,3 +147,9 @@ def test_half_a_turn_is_left_as_it_is():
 
 def test_normalising_keeps_the_direction():
     np.testing.assert_allclose(compiled("normalise", (0, 0, 3, 4)), [0, 0, 0.6, 0.8], rtol=1e-6)
+
+
+def test_the_norm_of_what_is_not_a_number_is_not_a_number():
+    # a norm of 0 would let a state that diverged pass for one at rest
+    assert math.isnan(compiled("safe_norm", (math.nan, 0, 0)))
+    assert math.isinf(compiled("safe_norm", (math.inf, 0, 0)))

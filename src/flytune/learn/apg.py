@@ -106,23 +106,27 @@ def update(task: Task, settings: ApgSettings, learner: Learner) -> tuple[Learner
 def _loss(task: Task, settings: ApgSettings, actor: Network, episodes: Episode, key: Array) -> Any:
     """Mean cost per step of the whole batch, and the episodes it ends with.
 
-    The batch is the last axis: arithmetic on scalars per vehicle then runs along contiguous memory. Only the episodes
-    between steps are kept for the gradient; what happens within a step is worked out again on the way back.
+    The batch is the last axis: arithmetic on scalars per vehicle then runs along contiguous memory. Of the physics,
+    only the episodes between steps are kept for the gradient; what happens within a step is worked out again.
     """
     task = dataclasses.replace(task, initial_state=settings.initial_state)
     scale = input_scale(settings)
 
-    def one_step(episode: Episode, normal: Array, reset_key: Array) -> Any:
-        action = jnp.tanh(actor(env.look(task, episode, normal) * scale))
+    def one_step(episode: Episode, action: Array, fresh: Episode) -> Any:
         moved, outcome = env.step(task, episode, action)
         cost = sum((barrier(margin, settings) for margin in outcome.margins.values()), start=jnp.zeros(()))
-        return env.autoreset(task, moved, outcome, reset_key), (outcome.reward - cost, outcome, moved)
+        return env.renewed(moved, outcome, fresh), (outcome.reward - cost, outcome, moved)
 
-    batch_step = jax.checkpoint(jax.vmap(one_step, in_axes=-1, out_axes=-1), prevent_cse=False)
+    step = jax.checkpoint(jax.vmap(one_step, in_axes=-1, out_axes=-1), prevent_cse=False)
+    look = jax.checkpoint(jax.vmap(partial(env.look, task), in_axes=-1, out_axes=0), prevent_cse=False)
     noise_key, reset_key = jax.random.split(key)
-    normal = jax.random.normal(noise_key, (settings.window, NOISY, settings.environments))
-    reset_keys = jax.random.split(reset_key, (settings.window, settings.environments))
-    episodes, (worth, outcome, moved) = jax.lax.scan(
-        lambda carry, now: batch_step(carry, *now), episodes, (normal, reset_keys)
-    )
+    noise = jax.random.normal(noise_key, (settings.window, NOISY, settings.environments))
+    # an episode that ends twice within one window starts again from the same state; drawing one each step costs a tenth
+    fresh = jax.vmap(partial(env.reset, task), out_axes=-1)(jax.random.split(reset_key, settings.environments))
+
+    def advance(episodes: Episode, normal: Array) -> Any:
+        action = jnp.tanh(actor(look(episodes, normal) * scale))
+        return step(episodes, action.T, fresh)
+
+    episodes, (worth, outcome, moved) = jax.lax.scan(advance, episodes, noise)
     return -jnp.mean(worth), (episodes, {**account(task, outcome, moved), "objective": jnp.mean(worth)})

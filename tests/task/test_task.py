@@ -1,0 +1,255 @@
+"""Tasks: the presets hold the paper's numbers, are written and read back exactly, and bad ones are refused."""
+
+import dataclasses
+import math
+
+import jax
+import pytest
+
+from flytune.errors import BadInput
+from flytune.physics.vehicle import load_vehicle, vehicle_names
+from flytune.task.reward import DualExponential, Exponential, Smoothness, Survival
+from flytune.task.task import load_task, preset_names, read_task_text, write_task
+
+PAPER_REWARDS = {
+    "baseline": {  # R11
+        "survival": Survival(reward=0.05),
+        "horizontal": DualExponential(of="horizontal", weight=0.25, share=0.6, wide=0.5, narrow=20.0),
+        "vertical": Exponential(of="vertical", weight=0.25, sharpness=4.0),
+        "velocity": Exponential(of="velocity", weight=0.1, sharpness=1.0),
+        "attitude": Exponential(of="attitude", weight=0.15, sharpness=0.5),
+        "smoothness": Smoothness(weight=0.1),
+    },
+    "acrobatic": {  # R12
+        "survival": Survival(reward=0.05),
+        "horizontal": DualExponential(of="horizontal", weight=0.25, share=0.6, wide=4.0, narrow=20.0),
+        "vertical": Exponential(of="vertical", weight=0.25, sharpness=4.0),
+        "velocity": Exponential(of="velocity", weight=0.08, sharpness=0.5),
+        "attitude": Exponential(of="attitude", weight=0.15, sharpness=0.5),
+        "smoothness": Smoothness(weight=0.1),
+    },
+    "inspection": {  # R13
+        "survival": Survival(reward=0.01),
+        "horizontal": DualExponential(of="horizontal", weight=0.25, share=0.6, wide=4.0, narrow=150.0),
+        "vertical": DualExponential(of="vertical", weight=0.25, share=0.6, wide=4.0, narrow=150.0),
+        "velocity": Exponential(of="velocity", weight=0.15, sharpness=1.5),
+        "attitude": DualExponential(of="attitude", weight=0.2, share=0.6, wide=0.5, narrow=150.0),
+        "smoothness": Smoothness(weight=0.02),
+    },
+}
+
+
+def refusal(task="baseline", **edits):
+    """The one line a task is refused with."""
+    with pytest.raises(BadInput) as caught:
+        load_task(task, {path.replace("__", "."): value for path, value in edits.items()})
+    text = str(caught.value)
+    assert "\n" not in text
+    return text
+
+
+# --- what ships ---
+
+
+def test_the_three_presets_of_the_paper_ship():
+    assert preset_names() == ["acrobatic", "baseline", "inspection"]
+
+
+@pytest.mark.parametrize("preset", PAPER_REWARDS)
+def test_a_preset_pays_exactly_what_the_paper_pays(tasks, preset):
+    assert tasks[preset].reward == PAPER_REWARDS[preset]
+
+
+@pytest.mark.parametrize("preset", PAPER_REWARDS)
+def test_a_preset_flies_the_papers_vehicle_to_the_papers_target(tasks, preset):
+    task = tasks[preset]
+    assert task.name == preset
+    assert task.vehicle == load_vehicle("crazyflie")
+    assert (task.target.position, task.target.yaw) == ((0, 0, 1), 0)  # R19
+    start = task.initial_state  # R15
+    assert (start.lowest_position, start.highest_position) == ((-1, -1, 0.1), (1, 1, 2))
+    assert (start.largest_tilt, start.largest_yaw) == (0.2, math.pi)
+    assert task.horizon == 500  # 5 s
+
+
+def test_a_trial_lasts_ten_seconds_and_twenty_for_the_slow_inspection(tasks):
+    assert {name: task.duration for name, task in tasks.items()} == {
+        "acrobatic": 10,
+        "baseline": 10,
+        "inspection": 20,
+    }
+
+
+@pytest.mark.parametrize("preset", PAPER_REWARDS)
+def test_a_preset_is_learned_with_the_papers_settings(tasks, preset):
+    ppo = tasks[preset].ppo
+    assert (ppo.minibatch, ppo.learning_rate, ppo.epochs, ppo.clip) == (128, 2e-4, 12, 0.15)  # R17
+    assert (ppo.steps, ppo.hidden) == (6_000_000, (64, 64))  # R18, R16
+    assert ppo.environments * ppo.rollout == 4 * 4096  # the samples of R18
+    # Stable-Baselines3's defaults
+    assert (ppo.discount, ppo.gae_lambda, ppo.value_weight, ppo.gradient_norm) == (0.99, 0.95, 0.5, 0.5)
+    assert (ppo.entropy_weight, ppo.initial_log_std) == (0.0, 0.0)
+
+
+def test_the_speed_bound_is_the_tightest_speed_termination(tasks):
+    assert {name: task.speed_bound for name, task in tasks.items()} == {
+        "acrobatic": 1.0,
+        "baseline": 0.8,
+        "inspection": 0.2,
+    }
+    free = dataclasses.replace(tasks["baseline"], termination={})
+    assert free.speed_bound is None
+
+
+# --- written and read back ---
+
+
+@pytest.fixture(scope="module")
+def every():
+    """Every preset with every vehicle, and the text of each."""
+    tasks = {(p, v): load_task(p, {"vehicle": v}) for p in preset_names() for v in vehicle_names()}
+    return {name: (task, write_task(task)) for name, task in tasks.items()}
+
+
+@pytest.mark.parametrize("vehicle", vehicle_names())
+@pytest.mark.parametrize("preset", preset_names())
+def test_a_task_is_read_back_exactly_as_it_was_written(every, preset, vehicle):
+    task, text = every[preset, vehicle]
+    assert task.vehicle == load_vehicle(vehicle)
+    again = read_task_text(text, "task.toml")
+    assert again == task
+    assert jax.tree.structure(again) == jax.tree.structure(task)
+    assert write_task(again) == text
+
+
+@pytest.mark.parametrize("preset", preset_names())
+def test_a_written_task_is_a_task_file(every, preset, tmp_path):
+    task, text = every[preset, "crazyflie-measured"]
+    (tmp_path / "mine.toml").write_text(text)
+    assert load_task(tmp_path / "mine.toml") == task
+    assert load_task(str(tmp_path / "mine.toml"), {"reward.velocity.weight": 0.3}).reward["velocity"].weight == 0.3
+
+
+def test_every_number_is_written_with_its_unit_its_range_and_where_it_comes_from(every):
+    lines = every["baseline", "crazyflie"][1].splitlines()
+    for line in (
+        "bound = 0.8 # m/s; above 0; paper R14",
+        "narrow = 20.0 # 1/unit(e)^2; above 0; paper R11",
+        "body_rate = 0.002 # rad/s; 0 or more; paper R8",
+        "mass = 0.033 # kg; above 0; paper R5",
+        "position = [0.0, 0.0, 1.0] # m; 3 values, each a finite number; paper R19",
+        "learning_rate = 0.0002 # 1; above 0; paper R17",
+    ):
+        assert line in lines
+
+
+@pytest.mark.parametrize("preset", preset_names())
+def test_no_number_of_a_preset_is_written_without_a_source(every, preset):
+    text = every[preset, "crazyflie"][1]
+    numbers = [line for line in text.split("[sources]")[0].splitlines() if " = " in line and '= "' not in line]
+    assert len(numbers) > 50
+    assert [line for line in numbers if line.count("; ") < 2] == []
+
+
+# --- edits ---
+
+
+def test_an_edit_changes_one_number_and_says_who_did_it(tasks):
+    task = load_task("baseline", {"reward.velocity.weight": 0.3, "termination.speed.bound": 1.5})
+    assert task.reward["velocity"] == Exponential(of="velocity", weight=0.3, sharpness=1.0)
+    assert task.speed_bound == 1.5
+    assert task.sources["reward.velocity.weight"] == "set by the user"
+    assert "weight = 0.3 # 1; 0 or more; set by the user" in write_task(task)
+    undone = load_task("baseline", {"reward.velocity.weight": 0.1})
+    assert undone.reward == tasks["baseline"].reward
+
+
+def test_a_vehicle_is_chosen_by_name_and_edited_by_path():
+    task = load_task("baseline", {"vehicle": "crazyflie-measured", "vehicle.mass": 0.04})
+    assert task.vehicle.mass == 0.04
+    assert task.vehicle.motor_rise_time_constant == 0.136
+    assert "mass = 0.04 # kg; above 0; set by the user" in write_task(task)
+
+
+def test_a_term_may_be_added_and_needs_to_be_complete():
+    task = load_task("baseline", {"reward.spin": {"kind": "exponential", "of": "body_rate", "weight": 0.1, "sharpness": 1.0}})
+    assert task.reward["spin"] == Exponential(of="body_rate", weight=0.1, sharpness=1.0)
+    assert refusal(reward__spin={"kind": "exponential", "of": "body_rate", "weight": 0.1}) == (
+        "reward.spin.sharpness: missing. Allowed: above 0 1/unit(e)^2."
+    )
+
+
+# --- what is refused ---
+
+
+def test_an_unknown_preset_is_refused_with_the_nearest_name():
+    text = refusal("baselin")
+    assert text.startswith("task: 'baselin' is no preset. Allowed: acrobatic, baseline, inspection, or a .toml file.")
+    assert text.endswith("Did you mean baseline?")
+    assert "Did you mean" not in refusal("zzz")
+
+
+def test_an_unknown_key_is_refused_with_the_nearest_one():
+    # the error of the specification, word for word
+    assert refusal(reward__velocity__wieght=0.2) == (
+        "reward.velocity.wieght: no such field. Did you mean reward.velocity.weight (now 0.1, allowed: 0 or more)?"
+    )
+    assert refusal(horizn=3).startswith("horizn: no such field. Did you mean horizon (now 500, allowed: a whole number")
+
+
+@pytest.mark.parametrize(
+    ("edits", "start"),
+    [
+        ({"reward__velocity__weight": "much"}, "reward.velocity.weight: 'much' is not allowed. Allowed: 0 or more."),
+        ({"reward__velocity__weight": math.nan}, "reward.velocity.weight: nan is not allowed. Allowed: 0 or more."),
+        ({"reward__velocity__weight": math.inf}, "reward.velocity.weight: inf is not allowed. Allowed: 0 or more."),
+        ({"reward__velocity__weight": -0.1}, "reward.velocity.weight: -0.1 is not allowed. Allowed: 0 or more."),
+        ({"reward__velocity__of": "speed"}, "reward.velocity.of: 'speed' is not allowed. Allowed: one of horizontal,"),
+        ({"reward__velocity__kind": "exponental"}, "reward.velocity.kind: 'exponental' is none of: survival, expo"),
+        ({"reward__horizontal__narrow": 0.1}, "reward.horizontal.narrow: 0.1 is wider than `wide`. Allowed: 0.5"),
+        ({"reward": {}}, "reward: no term. Allowed: one or more tables [reward.NAME]."),
+        ({"termination__speed__bound": 0.0}, "termination.speed.bound: 0.0 is not allowed. Allowed: above 0 m/s."),
+        ({"termination__attitude__bound": 4.0}, "termination.attitude.bound: 4.0 is not allowed. Allowed: above 0 to"),
+        ({"horizon": 1.5}, "horizon: 1.5 is not allowed. Allowed: a whole number, 1 or more"),
+        ({"horizon": 0}, "horizon: 0 is not allowed."),
+        ({"duration": 0.5}, "duration: 0.5 is not allowed. Allowed: above 0.5 s."),
+        ({"target__position": [0.0, 1.0]}, "target.position"),
+        ({"target__position": "home"}, "target.position: 'home' is not allowed. Allowed: 3 values, each a finite num"),
+        ({"initial_state__lowest_position": [0.0, 0.0, 3.0]}, "initial_state.lowest_position: 3.0 in z lies above"),
+        ({"vehicle__mass": 0.0}, "vehicle.mass: 0.0 is not allowed. Allowed: above 0 kg."),
+        ({"vehicle__maximum_rotor_speed_rpm": 100.0}, "vehicle.maximum_rotor_speed_rpm: 100.0 cannot lift"),
+        ({"vehicle": "crazyfly"}, "vehicle: 'crazyfly' is no vehicle."),
+        ({"vehicle": 3}, "vehicle: 3 is not allowed. Allowed: a table"),
+        ({"ppo__minibatch": 100}, "ppo.minibatch: 100 does not divide environments * rollout = 16384."),
+        ({"horizon__steps": 3}, "horizon.steps: horizon is a value, not a table."),
+    ],
+)  # fmt: skip
+def test_a_bad_value_is_refused_with_one_line_that_names_it(edits, start):
+    assert refusal(**edits).startswith(start)
+
+
+@pytest.mark.parametrize(
+    ("content", "start"),
+    [
+        (b"horizon = ", ": is not valid TOML: "),
+        (b"\xff\xfe\x00", ": is not text."),
+        (b"", ": horizon: missing."),
+        (b'vehicle = "crazyfly"', ""),
+    ],
+)
+def test_a_file_that_is_no_task_is_refused_by_its_name(tmp_path, content, start):
+    path = tmp_path / "mine.toml"
+    path.write_bytes(content)
+    text = refusal(path)
+    assert text.startswith(f"{path}{start}" if start else "vehicle: 'crazyfly' is no vehicle.")
+
+
+def test_a_missing_file_is_refused(tmp_path):
+    path = tmp_path / "none.toml"
+    assert refusal(path).startswith(f"{path}: cannot be read (No such file or directory).")
+    assert refusal(tmp_path).startswith("task: ")
+
+
+def test_a_text_that_is_no_complete_task_is_refused():
+    with pytest.raises(BadInput, match=r"^old/task\.toml: .*: missing\."):
+        read_task_text("horizon = 3", "old/task.toml")
