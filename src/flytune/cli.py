@@ -20,10 +20,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         options = _parser().parse_args(arguments)
         options.run(options)
     except FlytuneError as error:
-        print(f"flytune: {error}", file=sys.stderr)
+        print(error, file=sys.stderr)
         return error.exit_code
     except KeyboardInterrupt:
-        print("flytune: interrupted; nothing was written.", file=sys.stderr)
+        print("interrupted", file=sys.stderr)
         return 130
     except BrokenPipeError:
         # the reader went away (| head); keep the interpreter from complaining when it closes standard output

@@ -115,7 +115,7 @@ def test_a_document_is_read_back_exactly():
 @settings(max_examples=100, deadline=None)
 @given(st.floats(0, allow_infinity=False, allow_subnormal=True))
 def test_every_number_is_written_to_its_last_bit(mass):
-    text = document.write(Car(mass=mass, doors=2, centre=(0.0, 0.0, 0.0), wheels={}))
+    text = document.write(Car(mass=mass, doors=2, centre=(0.0, 0.0, 0.0), wheels={"left": Wheel(radius=0.3)}))
     assert document.read(Car, tomllib.loads(text)).mass == mass
 
 
@@ -125,6 +125,11 @@ def test_a_value_is_written_with_its_unit_range_and_the_nearest_source():
     assert "mass = 900.0 # kg; 0 or more; the scales" in text
     assert "[wheels.left]\nradius = 0.3 # m; above 0; the shop" in text
     assert "[wheels.right]\nradius = 0.31 # m; above 0; measured" in text
+
+
+def test_a_table_without_entries_is_read_back_too():
+    bare = Car(mass=1.0, doors=1, centre=(0.0, 0.0, 0.0), wheels={})
+    assert document.read(Car, tomllib.loads(document.write(bare))) == bare
 
 
 def test_an_empty_optional_field_is_left_out():

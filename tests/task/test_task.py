@@ -130,6 +130,12 @@ def test_a_written_task_is_a_task_file(every, preset, tmp_path):
     assert load_task(str(tmp_path / "mine.toml"), {"reward.velocity.weight": 0.3}).reward["velocity"].weight == 0.3
 
 
+def test_a_task_without_terminations_is_read_back():
+    task = load_task("baseline", {"termination": {}})
+    assert task.termination == {} and task.speed_bound is None
+    assert read_task_text(write_task(task), "task.toml") == task
+
+
 def test_every_number_is_written_with_its_unit_its_range_and_where_it_comes_from(every):
     lines = every["baseline", "crazyflie"][1].splitlines()
     for line in (
@@ -223,7 +229,7 @@ def test_an_unknown_key_is_refused_with_the_nearest_one():
         ({"ppo__minibatch": 100}, "ppo.minibatch: 100 does not divide environments * rollout = 16384."),
         ({"horizon__steps": 3}, "horizon.steps: horizon is a value, not a table."),
     ],
-)  # fmt: skip
+)
 def test_a_bad_value_is_refused_with_one_line_that_names_it(edits, start):
     assert refusal(**edits).startswith(start)
 

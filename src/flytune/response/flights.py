@@ -2,8 +2,11 @@
 
 import dataclasses
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+
+from flytune.errors import BadInput
 
 STATE_COLUMNS = {
     "position": ("x", "y", "z"),
@@ -55,7 +58,20 @@ class Flights:
         return float(self.time[-1])
 
     def save(self, path: Path) -> None:
-        """Write the trajectories as .npz: `data` [N, T + 1, C] with `columns` [C], `units` [C] and labels."""
+        """Write the trajectories as .npz: `data` [N, T + 1, C] with `columns` [C], `units` [C] and labels.
+
+        Raises:
+            BadInput: the file cannot be written.
+        """
+        whole = path.with_name(path.name + ".part")
+        try:
+            with whole.open("wb") as file:
+                np.savez_compressed(file, **self._arrays())
+            whole.replace(path)
+        except OSError as error:
+            raise BadInput(f"flights: {path} cannot be written ({error.strerror}). Give another file.") from None
+
+    def _arrays(self) -> dict[str, Any]:
         blocks = [np.broadcast_to(self.time[None, :, None], (*self.position.shape[:2], 1))]
         columns, units = ["time"], ["s"]
         for field, names in STATE_COLUMNS.items():
@@ -66,18 +82,17 @@ class Flights:
             blocks.append(margin[..., None])
             columns.append(f"margin_{name}")
             units.append("1")
-        np.savez_compressed(
-            path,
-            data=np.concatenate(blocks, axis=-1).astype(np.float32),
-            columns=np.array(columns),
-            units=np.array(units),
-            crashed=self.crashed,
-            target_position=self.target_position,
-            target_yaw=self.target_yaw,
-            who=self.who,
-            task=self.task,
-            vehicle=self.vehicle,
-            world=self.world,
-            seed=self.seed,
-            starts=self.starts,
-        )
+        return {
+            "data": np.concatenate(blocks, axis=-1).astype(np.float32),
+            "columns": np.array(columns),
+            "units": np.array(units),
+            "crashed": self.crashed,
+            "target_position": self.target_position,
+            "target_yaw": self.target_yaw,
+            "who": self.who,
+            "task": self.task,
+            "vehicle": self.vehicle,
+            "world": self.world,
+            "seed": self.seed,
+            "starts": self.starts,
+        }
