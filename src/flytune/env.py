@@ -77,10 +77,5 @@ def step(task: Task, episode: Episode, action: Float[Array, "4"]) -> tuple[Episo
 
 def autoreset(task: Task, episode: Episode, outcome: Outcome, key: jax.Array) -> Episode:
     """The episode itself, or a new one drawn with `key` where it has ended."""
-    return renewed(episode, outcome, reset(task, key))
-
-
-def renewed(episode: Episode, outcome: Outcome, fresh: Episode) -> Episode:
-    """The episode itself, or `fresh` where it has ended."""
     ended = outcome.terminated | outcome.truncated
-    return jax.tree.map(lambda new, old: jnp.where(ended, new, old), fresh, episode)
+    return jax.tree.map(lambda new, old: jnp.where(ended, new, old), reset(task, key), episode)

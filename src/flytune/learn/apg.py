@@ -112,21 +112,21 @@ def _loss(task: Task, settings: ApgSettings, actor: Network, episodes: Episode, 
     task = dataclasses.replace(task, initial_state=settings.initial_state)
     scale = input_scale(settings)
 
-    def one_step(episode: Episode, action: Array, fresh: Episode) -> Any:
+    def one_step(episode: Episode, action: Array, reset_key: Array) -> Any:
         moved, outcome = env.step(task, episode, action)
         cost = sum((barrier(margin, settings) for margin in outcome.margins.values()), start=jnp.zeros(()))
-        return env.renewed(moved, outcome, fresh), (outcome.reward - cost, outcome, moved)
+        return env.autoreset(task, moved, outcome, reset_key), (outcome.reward - cost, outcome, moved)
 
     step = jax.checkpoint(jax.vmap(one_step, in_axes=-1, out_axes=-1), prevent_cse=False)
     look = jax.checkpoint(jax.vmap(partial(env.look, task), in_axes=-1, out_axes=0), prevent_cse=False)
     noise_key, reset_key = jax.random.split(key)
     noise = jax.random.normal(noise_key, (settings.window, NOISY, settings.environments))
-    # an episode that ends twice within one window starts again from the same state; drawing one each step costs a tenth
-    fresh = jax.vmap(partial(env.reset, task), out_axes=-1)(jax.random.split(reset_key, settings.environments))
+    reset_keys = jax.random.split(reset_key, (settings.window, settings.environments))
 
-    def advance(episodes: Episode, normal: Array) -> Any:
+    def advance(episodes: Episode, now: tuple[Array, Array]) -> Any:
+        normal, keys = now
         action = jnp.tanh(actor(look(episodes, normal) * scale))
-        return step(episodes, action.T, fresh)
+        return step(episodes, action.T, keys)
 
-    episodes, (worth, outcome, moved) = jax.lax.scan(advance, episodes, noise)
+    episodes, (worth, outcome, moved) = jax.lax.scan(advance, episodes, (noise, reset_keys))
     return -jnp.mean(worth), (episodes, {**account(task, outcome, moved), "objective": jnp.mean(worth)})

@@ -1,0 +1,217 @@
+"""Policies: what they answer, how they start, and the file they are kept in (paper R7, R9, R16)."""
+
+import json
+import math
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import safetensors
+import safetensors.numpy
+
+from flytune.control.controller import Controller
+from flytune.control.policy import FORMAT, Network, Policy, load_policy, make_network, save_policy
+from flytune.errors import BadInput
+from flytune.task.observation import LAYOUT
+
+SIZES = (17, 64, 64, 4)
+ABOUT = {"task": "baseline", "vehicle": "crazyflie", "trainer": "apg", "seed": 3}
+
+
+@pytest.fixture(scope="module")
+def networks():
+    """A fresh actor, as training begins with."""
+    return jax.jit(lambda key: make_network(key, SIZES, 0.5))(jax.random.key(0))
+
+
+@pytest.fixture(params=["clip", "tanh"])
+def policy(request, networks):
+    """A policy with either way into the box."""
+    return Policy(actor=networks, input_scale=jnp.linspace(0.5, 2, 17), squash=request.param, about=ABOUT)
+
+
+@pytest.fixture
+def saved(policy, tmp_path):
+    """The file of a policy."""
+    save_policy(tmp_path / "policy.safetensors", policy)
+    return tmp_path / "policy.safetensors"
+
+
+@pytest.fixture
+def observations():
+    """A batch of observations, some of them far away."""
+    return jnp.asarray(np.random.default_rng(0).normal(0, 3, (32, 17)), jnp.float32)
+
+
+# --- what it answers ---
+
+
+def test_a_policy_is_a_controller(policy):
+    assert isinstance(policy, Controller)
+    memory, action = policy.act(policy.initial_memory(), jnp.zeros(17))
+    assert memory == () and action.shape == (4,)
+
+
+def test_an_action_is_the_actor_on_the_scaled_observation_squashed(policy, observations):
+    # written out: tanh(tanh(s o W0 + b0) W1 + b1) W2 + b2
+    x = np.asarray(observations) * np.linspace(0.5, 2, 17)
+    weights, biases = ([np.asarray(part, float) for part in parts] for parts in (policy.actor.weights, policy.actor.biases))
+    for weight, bias in zip(weights[:2], biases[:2], strict=True):
+        x = np.tanh(x @ weight + bias)
+    raw = x @ weights[2] + biases[2]
+    expected = np.tanh(raw) if policy.squash == "tanh" else np.clip(raw, -1, 1)
+    np.testing.assert_allclose(policy(observations), expected, atol=1e-5)
+
+
+def test_a_batch_of_observations_is_each_of_them_alone(policy, observations):
+    together = policy(observations)
+    for index in (0, 7, 31):
+        np.testing.assert_allclose(policy(observations[index]), together[index], atol=1e-6)
+        np.testing.assert_allclose(policy.act((), observations[index])[1], together[index], atol=1e-6)
+
+
+def test_an_action_stays_in_its_box_however_large_the_observation(policy, observations):
+    large = Policy(
+        actor=jax.tree.map(lambda leaf: 50 * leaf, policy.actor), input_scale=policy.input_scale, squash=policy.squash
+    )
+    actions = np.asarray(large(observations * 100))
+    assert np.abs(actions).max() == pytest.approx(1)
+    assert np.all(np.abs(actions) <= 1)
+
+
+def test_a_new_network_is_orthogonal_with_the_gains_of_the_papers_recipe(networks):
+    # 17 -> 64: the rows are orthogonal, W W^T = g^2 I; 64 -> 64 and 64 -> 4: the columns are, W^T W = g^2 I
+    first, middle, last = (np.asarray(weight, float) for weight in networks.weights)
+    np.testing.assert_allclose(first @ first.T, 2 * np.eye(17), atol=1e-5)
+    np.testing.assert_allclose(middle.T @ middle, 2 * np.eye(64), atol=1e-5)
+    np.testing.assert_allclose(last.T @ last, 0.5**2 * np.eye(4), atol=1e-5)
+    assert not any(np.any(bias) for bias in networks.biases)
+
+
+def test_another_seed_gives_another_network(networks):
+    other = jax.jit(lambda key: make_network(key, SIZES, 0.5))(jax.random.key(1))
+    assert not np.allclose(other.weights[0], networks.weights[0])
+
+
+# --- its file ---
+
+
+def test_a_policy_is_read_back_to_the_last_bit(policy, saved):
+    again = load_policy(saved)
+    assert (again.squash, again.about) == (policy.squash, ABOUT)
+    ours, theirs = jax.tree.leaves(policy), jax.tree.leaves(again)
+    assert len(ours) == len(theirs) == 7
+    for one, other in zip(ours, theirs, strict=True):
+        assert one.dtype == other.dtype
+        np.testing.assert_array_equal(one, other)
+
+
+def test_a_network_of_another_depth_is_read_back(tmp_path):
+    shallow = Network(weights=(jnp.ones((17, 4)),), biases=(jnp.zeros(4),))
+    save_policy(tmp_path / "p.safetensors", Policy(actor=shallow, input_scale=jnp.ones(17), squash="tanh"))
+    assert len(load_policy(tmp_path / "p.safetensors").actor.weights) == 1
+
+
+def test_the_header_says_what_the_policy_sees_does_and_was_trained_for(saved):
+    with safetensors.safe_open(saved, framework="numpy") as file:
+        header = file.metadata()
+    assert header["format"] == FORMAT
+    assert header["observation"] == LAYOUT
+    assert "[-1, 1]" in header["action"] and "0 (+x, -y), 1 (-x, -y), 2 (-x, +y), 3 (+x, +y)" in header["action"]
+    assert header["rate"] == "100 Hz"
+    assert json.loads(header["about"]) == ABOUT
+
+
+def test_saving_leaves_nothing_but_the_policy_behind(saved):
+    assert [path.name for path in saved.parent.iterdir()] == ["policy.safetensors"]
+
+
+# --- what is refused ---
+
+
+def refusal(path):
+    """The one line that a file is refused with."""
+    with pytest.raises(BadInput) as caught:
+        load_policy(path)
+    text = str(caught.value)
+    assert text.startswith(f"{path}: ") and "\n" not in text
+    return text.removeprefix(f"{path}: ")
+
+
+def forge(path, change_header=None, change_tensors=None):
+    """The same file with another header or other tensors."""
+    with safetensors.safe_open(path, framework="numpy") as file:
+        header = file.metadata() | (change_header or {})
+    tensors = safetensors.numpy.load_file(path)
+    for name, tensor in (change_tensors or {}).items():
+        if tensor is None:
+            del tensors[name]
+        else:
+            tensors[name] = tensor
+    safetensors.numpy.save_file(tensors, path, metadata=header)
+    return path
+
+
+def test_a_missing_file_is_refused(tmp_path):
+    assert refusal(tmp_path / "none.safetensors").startswith("no such file.")
+
+
+def test_a_directory_is_refused(tmp_path):
+    assert "is not a policy" in refusal(tmp_path)
+
+
+@pytest.mark.parametrize(
+    "content",
+    [b"", b"\x00", b"not a policy at all", bytes(range(256)) * 8, b"\xff" * 64],
+    ids=["empty", "one byte", "text", "bytes", "huge header"],
+)
+def test_a_file_that_is_no_safetensors_is_refused(tmp_path, content):
+    path = tmp_path / "policy.safetensors"
+    path.write_bytes(content)
+    assert refusal(path).startswith("is not a policy (")
+
+
+def test_half_a_file_is_refused(saved):
+    saved.write_bytes(saved.read_bytes()[:-100])
+    assert refusal(saved).startswith("is not a policy (")
+
+
+def test_somebody_elses_safetensors_are_refused(tmp_path):
+    path = tmp_path / "model.safetensors"
+    safetensors.numpy.save_file({"weight": np.zeros((3, 3), np.float32)}, path)
+    assert refusal(path) == f"is not a flytune policy (format None). Allowed: {FORMAT}."
+    safetensors.numpy.save_file({"weight": np.zeros(3, np.float32)}, path, metadata={"format": "pt"})
+    assert refusal(path).startswith("is not a flytune policy (format 'pt').")
+
+
+def test_a_policy_of_another_observation_is_refused(saved):
+    assert refusal(forge(saved, {"observation": "13 numbers"})).startswith(
+        f"was trained on another observation, '13 numbers'. Allowed: {LAYOUT}."
+    )
+
+
+@pytest.mark.parametrize(
+    ("changes", "start"),
+    [
+        ({"actor.0.weight": np.zeros((16, 64), np.float32)}, "layer 0 has shape (16, 64), allowed: (17, 64)."),
+        ({"actor.1.weight": np.zeros((32, 64), np.float32)}, "layer 1 has shape (32, 64), allowed: (64, 64)."),
+        ({"actor.1.bias": np.zeros(63, np.float32)}, "layer 1 has shape"),
+        ({"actor.2.weight": np.zeros((64, 3), np.float32), "actor.2.bias": np.zeros(3, np.float32)}, "maps (17,) to 3"),
+        ({"input_scale": np.ones(16, np.float32)}, "maps (16,) to 4"),
+        ({"actor.2.bias": np.full(4, math.nan, np.float32)}, "actor.2.bias holds numbers that are not finite."),
+        ({"input_scale": np.full(17, math.inf, np.float32)}, "input_scale holds numbers that are not finite."),
+        ({"actor.2.bias": None}, "is a damaged policy"),
+        ({"input_scale": None}, "is a damaged policy"),
+        ({"extra": np.zeros(3, np.float32)}, "is a damaged policy"),
+        ({"actor.0.weight": np.zeros((17, 64), np.int32)}, ""),
+        ({"actor.0.weight": np.zeros((), np.float32)}, ""),
+    ],
+)
+def test_a_policy_with_damaged_tensors_is_refused(saved, changes, start):
+    assert refusal(forge(saved, change_tensors=changes)).startswith(start)
+
+
+def test_a_policy_with_a_damaged_header_is_refused(saved):
+    assert refusal(forge(saved, {"squash": "relu"})).startswith("is a damaged policy")
+    assert refusal(forge(saved, {"squash": "tanh", "about": "{not json"}))
