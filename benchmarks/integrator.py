@@ -2,8 +2,8 @@
 
     python benchmarks/integrator.py
 
-A hard manoeuvre of 2 s is flown with several integrators and compared with DOP853 at a tolerance of 1e-11 in float64, on
-equations written out once more in NumPy; then the same integrators are timed, forward and with their gradient.
+A hard manoeuvre of 2 s is flown with several integrators and compared with DOP853 in float64, at a tolerance of 1e-11,
+on equations written out once more in NumPy; then the same integrators are timed, forward and with their gradient.
 """
 
 import os
@@ -30,7 +30,7 @@ ROLL, PITCH, YAW = np.array([[-1, -1, 1, 1], [-1, 1, 1, -1], [-1, 1, -1, 1]])
 
 
 def manoeuvre(frequency: float, roll: float, pitch: float, lift: float) -> np.ndarray:
-    """Actions [T, 4] that swing roll and pitch, not in step, as sin^3 would: from level and still, to both sides alike."""
+    """Actions [T, 4] that swing roll and pitch, not in step, to both sides alike, from level and still."""
     phase = 2 * math.pi * frequency * CONTROL_PERIOD * np.arange(STEPS)[:, None]
 
     def swing(phase: np.ndarray) -> np.ndarray:

@@ -151,8 +151,8 @@ def test_autoreset_replaces_the_episodes_that_have_ended_and_no_others(baseline)
     after, outcome, renewed, fresh = advance(batch, keys)
     assert (outcome.terminated | outcome.truncated).tolist() == [False, True, True, False]
     for index, ended in enumerate([False, True, True, False]):
-        pick = lambda tree: jax.tree.map(lambda leaf: leaf[index], tree)  # noqa: B023, E731
-        same(pick(renewed), pick(fresh) if ended else pick(after))
+        expected = fresh if ended else after
+        same([leaf[index] for leaf in jax.tree.leaves(renewed)], [leaf[index] for leaf in jax.tree.leaves(expected)])
     assert renewed.last_action[1].tolist() == [0, 0, 0, 0]
     np.testing.assert_array_equal(renewed.last_action[0], np.float32(ACTION))
     assert renewed.steps.tolist() == [1, 0, 0, 11]
@@ -169,7 +169,7 @@ def fly_batch():
     @jax.jit
     def run(task, keys, actions):
         start = jax.vmap(lambda key: env.reset(task, key))(keys)
-        return jax.lax.scan(lambda e, a: jax.vmap(lambda e, a: env.step(task, e, a))(e, a), start, actions)
+        return jax.lax.scan(lambda e, a: jax.vmap(env.step, (None, 0, 0))(task, e, a), start, actions)
 
     return run
 
@@ -195,9 +195,8 @@ def test_a_batch_of_episodes_is_each_of_them_alone(preset, vehicle, fly_batch, f
     together = fly_batch(task, BATCH, ACTIONS)
     for index in range(8):
         alone = fly_single(task, BATCH[index], ACTIONS[:, index])
-        of_batch = jax.tree.map(lambda leaf: leaf[index], together[0]), jax.tree.map(
-            lambda leaf: leaf[:, index], together[1]
-        )
+        of_batch = [leaf[index] for leaf in jax.tree.leaves(together[0])]
+        of_batch += [leaf[:, index] for leaf in jax.tree.leaves(together[1])]
         same(of_batch, alone, rtol=1e-5, atol=1e-5)
 
 

@@ -162,7 +162,7 @@ def test_a_spin_without_torque_keeps_its_energy_and_its_angular_momentum(paper, 
 @pytest.mark.parametrize("name", vehicle_names())
 def test_no_action_hovers_for_ten_seconds(name, fly):
     # Hover is unstable. float32 knows the force of two motors to 2 * 0.081 N * 2^-24 = 1e-8 N, a residual torque of
-    # 2.8e-10 N m at the lever, 1.6e-5 rad/s^2; after t = 10 s: 1.6e-4 rad/s, and g 1.6e-5 t^4 / 24 = 0.07 m to the side.
+    # 2.8e-10 N m at the lever, 1.6e-5 rad/s^2; after t = 10 s: 1.6e-4 rad/s, and g 1.6e-5 t^4 / 24 = 0.07 m aside.
     vehicle = load_vehicle(name)
     flown = fly(vehicle, state(vehicle), np.zeros((1000, 4)))
     assert np.abs(flown.position[-1, :2]).max() < 0.07

@@ -120,7 +120,9 @@ def test_every_number_is_written_to_its_last_bit(mass):
 
 
 def test_a_value_is_written_with_its_unit_range_and_the_nearest_source():
-    text = document.write(CAR, {"wheels": "the shop", "wheels.right.radius": "measured", "mass": "the scales"}, "My car")
+    text = document.write(
+        CAR, {"wheels": "the shop", "wheels.right.radius": "measured", "mass": "the scales"}, "My car"
+    )
     assert text.startswith("# My car\n")
     assert "mass = 900.0 # kg; 0 or more; the scales" in text
     assert "[wheels.left]\nradius = 0.3 # m; above 0; the shop" in text

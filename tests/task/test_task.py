@@ -178,7 +178,9 @@ def test_a_vehicle_is_chosen_by_name_and_edited_by_path():
 
 
 def test_a_term_may_be_added_and_needs_to_be_complete():
-    task = load_task("baseline", {"reward.spin": {"kind": "exponential", "of": "body_rate", "weight": 0.1, "sharpness": 1.0}})
+    task = load_task(
+        "baseline", {"reward.spin": {"kind": "exponential", "of": "body_rate", "weight": 0.1, "sharpness": 1.0}}
+    )
     assert task.reward["spin"] == Exponential(of="body_rate", weight=0.1, sharpness=1.0)
     assert refusal(reward__spin={"kind": "exponential", "of": "body_rate", "weight": 0.1}) == (
         "reward.spin.sharpness: missing. Allowed: above 0 1/unit(e)^2."

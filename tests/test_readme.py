@@ -1,0 +1,56 @@
+"""What the README tells a newcomer to type."""
+
+import re
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from flytune.cli import _parser
+
+ROOT = Path(__file__).parents[1]
+README = (ROOT / "README.md").read_text(encoding="utf-8")
+COMMANDS = re.findall(r"^    flytune (.*)$", README, flags=re.MULTILINE)
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_every_command_of_the_readme_is_understood(command):
+    words = shlex.split(command.split(" > ")[0], comments=True)
+    assert callable(_parser().parse_args(words).run)
+
+
+def test_every_edit_of_the_readme_changes_the_task():
+    from flytune.document import parse_assignment
+    from flytune.task.task import load_task, write_task
+
+    edits = [word for command in COMMANDS for word in shlex.split(command, comments=True) if "=" in word]
+    assert edits
+    for edit in edits:
+        path, value = parse_assignment(edit)
+        assert write_task(load_task("baseline", {path: value})) != write_task(load_task("baseline"))
+
+
+def test_every_file_the_readme_links_to_is_there():
+    links = re.findall(r"\]\(([^)]+)\)", README)
+    assert links
+    assert [link for link in links if not (ROOT / link).exists()] == []
+
+
+def test_the_names_the_readme_lists_are_the_ones_that_ship():
+    from flytune.physics.vehicle import vehicle_names
+    from flytune.task.task import preset_names
+
+    listed = set(re.findall(r"^\| `([\w-]+)`", README, flags=re.MULTILINE))
+    assert set(preset_names()) | set(vehicle_names()) | {"apg", "ppo"} == listed
+
+
+@pytest.mark.slow
+def test_the_python_example_runs_as_it_stands(tmp_path):
+    (example,) = re.findall(r"```python\n(.*?)```", README, flags=re.DOTALL)
+    answer = subprocess.run(
+        [sys.executable, "-c", example], cwd=tmp_path, capture_output=True, text=True, timeout=900, check=False
+    )
+    assert answer.returncode == 0, answer.stderr
+    assert "100/100" in answer.stdout
