@@ -48,6 +48,21 @@ def test_log_probability_is_that_of_a_diagonal_gaussian():
     assert float(given) == pytest.approx(wanted, rel=1e-5)
 
 
+@pytest.mark.parametrize("number", [1, 2, 100, 16384])
+def test_a_shuffle_holds_every_index_once_and_differs_from_key_to_key(number):
+    orders = [np.asarray(ppo.shuffle(jax.random.key(seed), number)) for seed in (0, 1)]
+    for order in orders:
+        np.testing.assert_array_equal(np.sort(order), np.arange(number))
+    assert number < 100 or (orders[0] != orders[1]).mean() > 0.9
+
+
+def test_every_index_is_as_likely_in_every_place_of_a_shuffle():
+    # 8 indices, 4,000 shuffles: each of the 64 counts is binomial with mean 500 and standard deviation 20.9
+    orders = np.asarray(jax.vmap(lambda key: ppo.shuffle(key, 8))(jax.random.split(jax.random.key(0), 4000)))
+    counts = np.array([[np.sum(orders[:, place] == index) for index in range(8)] for place in range(8)])
+    assert np.abs(counts - 500).max() < 5 * 20.9
+
+
 def small_batch(parameters, size=8):
     key = jax.random.key(3)
     observation = jax.random.normal(key, (size, 17))

@@ -13,6 +13,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import optax
+from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
 from flytune import env
@@ -41,7 +42,7 @@ class Learner:
 
     parameters: Parameters
     average: Network  # exponential moving average of the actor over updates; the one that is flown
-    optimiser: Any
+    optimiser: Any  # Adam's moments of the parameters as one vector
     episodes: Episode  # a batch, along the last axis
     key: Array
     updates: Array
@@ -81,7 +82,7 @@ def start(task: Task, settings: PpoSettings, key: Array) -> Learner:
     return Learner(
         parameters=parameters,
         average=parameters.actor,
-        optimiser=_optimiser(settings).init(parameters),  # pyright: ignore[reportArgumentType]
+        optimiser=_optimiser(settings).init(ravel_pytree(parameters)[0]),
         episodes=jax.vmap(partial(env.reset, task), out_axes=-1)(keys),
         key=key,
         updates=jnp.zeros((), jnp.int32),
@@ -194,6 +195,8 @@ def learn(
 ) -> tuple[Parameters, Any, dict[str, Array]]:
     """Parameters and optimiser after all epochs over the samples [S, ...], and the mean losses of the last epoch."""
     samples = batch.action.shape[0]
+    # one vector, so that clipping and Adam are a few long loops and not many short ones
+    flat, restore = ravel_pytree(parameters)
     # one matrix, so that shuffling is one gather
     columns = jnp.concatenate(
         [
@@ -205,11 +208,11 @@ def learn(
     )
 
     def epoch(carry: Any, key: Array) -> Any:
-        shuffled = columns[jax.random.permutation(key, samples)]
+        shuffled = columns[shuffle(key, samples)]
         return jax.lax.scan(minibatch, carry, shuffled.reshape(-1, settings.minibatch, columns.shape[-1]))
 
     def minibatch(carry: Any, rows: Array) -> Any:
-        parameters, optimiser = carry
+        flat, optimiser = carry
         part = Batch(
             observation=rows[:, :SIZE],
             action=rows[:, SIZE : SIZE + 4],
@@ -217,12 +220,27 @@ def learn(
             advantage=rows[:, SIZE + 5],
             target=rows[:, SIZE + 6],
         )
-        gradient, losses = jax.grad(loss, argnums=1, has_aux=True)(settings, parameters, part)
-        return descend(_optimiser(settings), gradient, optimiser, parameters), losses
+        gradient, losses = jax.grad(lambda flat: loss(settings, restore(flat), part), has_aux=True)(flat)
+        return descend(_optimiser(settings), gradient, optimiser, flat), losses
 
     keys = jax.random.split(key, settings.epochs)
-    (parameters, optimiser), losses = jax.lax.scan(epoch, (parameters, optimiser), keys)
-    return parameters, optimiser, {name: jnp.mean(values[-1]) for name, values in losses.items()}
+    (flat, optimiser), losses = jax.lax.scan(epoch, (flat, optimiser), keys)
+    return restore(flat), optimiser, {name: jnp.mean(values[-1]) for name, values in losses.items()}
+
+
+def shuffle(key: Array, number: int) -> Array:
+    """The indices 0 to number - 1 in random order.
+
+    One sort of random numbers whose low bits are the index: thirty times faster on a CPU than a sort of pairs. Of
+    16,384 indices about one in thirty shares its 18 random bits with another, and such two keep their order; with
+    fewer than 16 random bits left, `jax.random.permutation` does it.
+    """
+    low = max(number - 1, 1).bit_length()
+    if low > 16:
+        return jax.random.permutation(key, number)
+    mask = jnp.uint32(2**low - 1)
+    random = jax.random.bits(key, (number,), jnp.uint32) & ~mask
+    return jnp.sort(random | jnp.arange(number, dtype=jnp.uint32)) & mask
 
 
 def loss(settings: PpoSettings, parameters: Parameters, batch: Batch) -> tuple[Array, dict[str, Array]]:
