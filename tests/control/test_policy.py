@@ -28,7 +28,9 @@ def networks():
 @pytest.fixture(params=["clip", "tanh"])
 def policy(request, networks):
     """A policy with either way into the box."""
-    return Policy(actor=networks, input_scale=jnp.linspace(0.5, 2, 17), squash=request.param, about=ABOUT)
+    biases = tuple(jnp.linspace(-0.3, 0.4, bias.size) for bias in networks.biases)
+    actor = Network(weights=networks.weights, biases=biases)
+    return Policy(actor=actor, input_scale=jnp.linspace(0.5, 2, 17), squash=request.param, about=ABOUT)
 
 
 @pytest.fixture

@@ -63,15 +63,13 @@ def test_the_average_is_the_mean_of_the_first_weights(small_task):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("vehicle", ["crazyflie", "crazyflie-measured"])
-def test_apg_hovers_with_every_trial_settled_on_every_axis(vehicle):
-    task = load_task("baseline", {"vehicle": vehicle})
+@pytest.mark.parametrize(("vehicle", "updates", "wanted"), [("crazyflie", 300, 99), ("crazyflie-measured", 600, 95)])
+def test_apg_settles_the_trials_on_every_axis_without_a_crash(vehicle, updates, wanted):
+    task = load_task("baseline", {"vehicle": vehicle, "apg.updates": updates})
     learner = apg.start(task, task.apg, jax.random.key(0))
     for _ in range(task.apg.updates):
         learner, _ = apg.update(task, task.apg, learner)
     judgement = judge(fly(apg.policy(task.apg, learner), task))
-    wanted = 99 if vehicle == "crazyflie" else 95
-    assert {axis: judgement.settled(axis) >= wanted for axis in ("x", "y", "z", "yaw")} == dict.fromkeys(
-        ("x", "y", "z", "yaw"), True
-    )
+    settled = {axis: judgement.settled(axis) for axis in ("x", "y", "z", "yaw")}
+    assert min(settled.values()) >= wanted, settled
     assert not judgement.crashed.any()
