@@ -160,7 +160,9 @@ def allowed(annotation: Any) -> str:
     upper = [(getattr(d, _UPPER[type(d)]), type(d)) for d in details if type(d) in _UPPER]
     number = "a whole number" if base is int else ""
     if lower and upper:
-        text = f"{'above ' if lower[0][1] is annotated_types.Gt else ''}{lower[0][0]} to {upper[0][0]}"
+        above = "above " if lower[0][1] is annotated_types.Gt else ""
+        below = "below " if upper[0][1] is annotated_types.Lt else ""
+        text = f"{above}{lower[0][0]} to {below}{upper[0][0]}"
     elif lower:
         text = f"above {lower[0][0]}" if lower[0][1] is annotated_types.Gt else f"{lower[0][0]} or more"
     elif upper:
@@ -326,7 +328,7 @@ def _fill(table: Any, node: Any, path: tuple[str, ...], sources: Mapping[str, st
         if dataclasses.is_dataclass(original):
             _fill(inner, original, (*path, name), sources)
         elif all(isinstance(item, dict) for item in value.values()):
-            inner = tomlkit.table(is_super_table=True)
+            inner = tomlkit.table(is_super_table=bool(value))
             for key, item in original.items():
                 leaf = tomlkit.table()
                 _fill(leaf, item, (*path, name, key), sources)

@@ -29,8 +29,8 @@ ACTION = (
 class Network:
     """A multilayer perceptron with tanh between its layers and none after the last."""
 
-    weights: tuple[Float[Array, "inputs outputs"], ...]
-    biases: tuple[Float[Array, "outputs"], ...]
+    weights: tuple[Float[Array, "_ _"], ...]  # inputs x outputs
+    biases: tuple[Float[Array, "_"], ...]
 
     def __call__(self, inputs: Float[Array, "*batch inputs"]) -> Float[Array, "*batch outputs"]:
         """The outputs for one input or a batch of them."""
@@ -130,7 +130,11 @@ def _assemble(path: Path, header: dict[str, Any], tensors: dict[str, np.ndarray]
     names = {"input_scale", *(f"actor.{i}.{part}" for i in range(layers) for part in ("weight", "bias"))}
     if layers < 1 or set(tensors) != names or header.get("squash") not in ("clip", "tanh"):
         raise BadInput(f"{path}: is a damaged policy (tensors {sorted(tensors)}). Train it again.")
-    sizes = [observation.SIZE, *(tensors[f"actor.{i}.weight"].shape[-1] for i in range(layers))]
+    shapes = [tensors[f"actor.{index}.weight"].shape for index in range(layers)]
+    for index, shape in enumerate(shapes):
+        if len(shape) != 2:
+            raise BadInput(f"{path}: layer {index} has shape {shape}, allowed: a matrix. Train it again.")
+    sizes = [observation.SIZE, *(shape[1] for shape in shapes)]
     for index in range(layers):
         wanted = (sizes[index], sizes[index + 1])
         weight, bias = tensors[f"actor.{index}.weight"], tensors[f"actor.{index}.bias"]

@@ -78,5 +78,5 @@ def roll_pitch(quaternion: Components) -> tuple[Any, Any]:
 def safe_norm(vector: Components) -> Any:
     """The Euclidean norm, with gradient 0 instead of NaN at the origin."""
     squared = squared_norm(vector)
-    positive = squared > 0
-    return jnp.where(positive, jnp.sqrt(jnp.where(positive, squared, 1.0)), 0.0)
+    nonzero = squared != 0  # true of NaN, which must stay NaN
+    return jnp.where(nonzero, jnp.sqrt(jnp.where(nonzero, squared, 1.0)), 0.0)

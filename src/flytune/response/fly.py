@@ -63,11 +63,11 @@ def fly(
     steps = round(duration / CONTROL_PERIOD)
     keys = jax.vmap(partial(jax.random.fold_in, jax.random.key(seed)))(jnp.arange(trials))
     record = _fly_all(controller, task, EVALUATION_STARTS[starts], keys, steps)
-    states, actions, left, crashed, finite = jax.tree.map(np.asarray, record)
+    states, actions, left, crashed, given, finite = jax.tree.map(np.asarray, record)
     if not np.all(finite):
         trial, step = np.argwhere(~finite)[0]
         raise Diverged(
-            f"{who or 'controller'}: action {actions[trial, step]} is not finite in trial {trial} "
+            f"{who or 'controller'}: action {given[trial, step]} is not finite in trial {trial} "
             f"at {step * CONTROL_PERIOD:.2f} s, on a finite observation."
         )
     return Flights(
@@ -98,7 +98,7 @@ def _fly_all(controller: Any, task: Task, starts: InitialState, keys: jax.Array,
 
 
 def _fly_one(controller: Any, task: Task, starts: InitialState, key: jax.Array, steps: int) -> Any:
-    """States, actions and margins at samples 0 to `steps`, whether it crashed, and which actions were finite."""
+    """States, actions and margins at samples 0 to `steps`; crashed or not; the actions as given, and which were finite."""
     start_key, noise_key = jax.random.split(key)
     start = starts.draw(task.vehicle, start_key)
     rest = jnp.zeros(4)
@@ -109,22 +109,22 @@ def _fly_one(controller: Any, task: Task, starts: InitialState, key: jax.Array, 
         seen = observe(task.target, task.noise, state, last_action, normal)
         memory, action = controller.act(memory, seen)
         finite = jnp.all(jnp.isfinite(action)) | ~jnp.all(jnp.isfinite(seen))
-        action = jnp.clip(action, -1.0, 1.0)
+        given, action = action, jnp.clip(action, -1.0, 1.0)
         moved = dynamics.step(task.vehicle, state, action)
         crashed = crashed | _is_lost(task, moved)
         kept = jax.tree.map(lambda new, old: jnp.where(crashed, old, new), (moved, action), (state, last_action))
-        return (*kept, memory, crashed), (*kept, finite)
+        return (*kept, memory, crashed), (*kept, given, finite)
 
     carry = (start, rest, controller.initial_memory(), _is_lost(task, start))
-    (_, _, _, crashed), (states, actions, finite) = jax.lax.scan(advance, carry, jnp.arange(steps))
+    (_, _, _, crashed), (states, actions, given, finite) = jax.lax.scan(advance, carry, jnp.arange(steps))
     states = jax.tree.map(lambda first, later: jnp.concatenate([first[None], later]), start, states)
     actions = jnp.concatenate([rest[None], actions])
     changes = jnp.diff(actions, axis=0, prepend=rest[None])
     left = jax.vmap(lambda s, change: margins(task.termination, situation(task.target, s, change)))(states, changes)
-    return states, actions, left, crashed, finite
+    return states, actions, left, crashed, given, finite
 
 
 def _is_lost(task: Task, state: State) -> jax.Array:
     distance = safe_norm(position_error(task.target, state.position))
-    body = jnp.stack([*state.attitude, *state.velocity, *state.body_rate])
+    body = jnp.stack([*state.position, *state.attitude, *state.velocity, *state.body_rate])
     return ~((distance <= BALL) & jnp.all(jnp.isfinite(body)))
