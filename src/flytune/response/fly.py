@@ -98,7 +98,7 @@ def _fly_all(controller: Any, task: Task, starts: InitialState, keys: jax.Array,
 
 
 def _fly_one(controller: Any, task: Task, starts: InitialState, key: jax.Array, steps: int) -> Any:
-    """States, actions and margins at samples 0 to `steps`; crashed or not; the actions as given, and which were finite."""
+    """States, actions, margins at samples 0 to `steps`; crashed or not; the actions as given, and which were finite."""
     start_key, noise_key = jax.random.split(key)
     start = starts.draw(task.vehicle, start_key)
     rest = jnp.zeros(4)
