@@ -1,4 +1,4 @@
-"""Run directories: what a training leaves behind, and what it needs to go on (see the contract in docs/)."""
+"""Run directories: what a training leaves behind, and what it needs to go on (docs/definitions.md)."""
 
 import json
 import os
