@@ -3,6 +3,7 @@
 import json
 import os
 import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -175,6 +176,16 @@ def test_bad_trials_are_refused_before_anything_flies(folder, run, arguments, wo
     assert (folder / run / "evaluation.json").read_bytes() == before
 
 
+@pytest.mark.parametrize(
+    ("name", "content"), [("run.json", "{}"), ("run.json", "[]"), ("metrics.jsonl", "3\n"), ("metrics.jsonl", "{")]
+)
+def test_a_damaged_run_is_named_and_refused(folder, run, tmp_path, name, content):
+    shutil.copytree(folder / run, tmp_path / "run")
+    (tmp_path / "run" / name).write_text(content)
+    answer = flytune("evaluate", "run", cwd=tmp_path, expect=2)
+    assert len(answer.stderr.strip().splitlines()) == 1 and f"run/{name}: is damaged" in answer.stderr
+
+
 def test_a_directory_that_holds_a_run_is_refused(folder, run):
     before = {path: path.read_bytes() for path in (folder / run).rglob("*") if path.is_file()}
     answer = flytune("train", "baseline", "--set", *SMALL, "--out", run, cwd=folder, expect=2)
@@ -207,10 +218,11 @@ def test_ctrl_c_saves_a_checkpoint_exits_with_130_and_resumes_to_the_same_policy
             break
     message = process.stderr.read()
     assert process.wait(timeout=120) == 130, message
-    assert "cut/checkpoint" in message and "--resume" in message
+    assert "cut/checkpoint" in message
+    assert "flytune train cut/task.toml --trainer apg --seed 0 --out cut --resume" in message
     assert not (folder / "cut" / "policy.safetensors").exists()
     assert "has not ended" in flytune("evaluate", "cut", cwd=folder, expect=2).stderr
-    flytune(*train, "--out", "cut", "--resume", cwd=folder)
+    flytune(*["train", "cut/task.toml", "--trainer", "apg", "--seed", "0", "--out", "cut", "--resume"], cwd=folder)
     assert (folder / "cut" / "policy.safetensors").read_bytes() == (
         folder / "whole" / "policy.safetensors"
     ).read_bytes()

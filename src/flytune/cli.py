@@ -19,6 +19,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         options = _parser().parse_args(arguments)
         options.run(options)
+        sys.stdout.flush()
     except FlytuneError as error:
         print(error, file=sys.stderr)
         return error.exit_code
@@ -156,17 +157,23 @@ def _evaluate(options: argparse.Namespace) -> None:
     from flytune.learn.pilot import find_pilot
     from flytune.response.judge import judge
 
-    if "flights" in options and not options.flights.parent.is_dir():
-        raise BadInput(f"flights: {options.flights.parent} is no directory. Give a file in one that exists.")
+    if "flights" in options:
+        _check_file("flights", options.flights)
+    if "out" in options and os.path.exists(options.out) and not os.path.isdir(options.out):
+        raise BadInput(f"out: {options.out} is a file. Give a directory.")
     pilot = find_pilot(options.who)
     flights, _ = _fly(pilot, options)
     judgement = judge(flights)
     if "flights" in options:
         flights.save(options.flights)
-    folder = options.out if "out" in options else Path(options.who)
-    if "out" in options or folder.is_dir():
-        _write_evaluation(folder, judgement.to_dict())
-    print(json.dumps(judgement.to_dict()) if options.json else judgement.table())
+    print(json.dumps(judgement.to_dict()) if options.json else judgement.table(), flush=True)
+    if "out" in options:
+        _write_evaluation(options.out, judgement.to_dict())
+    elif os.path.isdir(options.who):
+        try:
+            _write_evaluation(Path(options.who), judgement.to_dict())
+        except BadInput as error:  # somebody else's run, perhaps; the result itself has been printed
+            print(f"not kept: {error}", file=sys.stderr)
 
 
 def _report(options: argparse.Namespace) -> None:
@@ -174,6 +181,7 @@ def _report(options: argparse.Namespace) -> None:
     from flytune.response.judge import judge
     from flytune.show.report import Entry, write_report
 
+    _check_file("out", options.out)
     entries = []
     for pilot in [find_pilot(who) for who in options.who]:
         flights, task = _fly(pilot, options)
@@ -221,6 +229,14 @@ def _bench(options: argparse.Namespace) -> None:
 
     result = bench(options.what)
     print(json.dumps(result.to_dict()) if options.json else result.table())
+
+
+def _check_file(option: str, path: Path) -> None:
+    """Refuse a file that cannot be written, before anything is flown."""
+    if not os.path.isdir(path.parent):
+        raise BadInput(f"{option}: {path.parent} is no directory. Give a file in one that exists.")
+    if os.path.isdir(path):
+        raise BadInput(f"{option}: {path} is a directory. Give a file.")
 
 
 def _write_evaluation(folder: Path, judgement: dict[str, Any]) -> None:

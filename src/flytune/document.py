@@ -51,7 +51,7 @@ def parse(text: str, where: str) -> dict[str, Any]:
     """
     try:
         return tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
+    except ValueError as error:  # also of a number with thousands of digits
         raise BadInput(f"{where}: is not valid TOML: {error}.") from None
 
 
@@ -114,7 +114,7 @@ def parse_assignment(text: str) -> tuple[str, Any]:
         raise BadInput(f"{text}: not an assignment. Write path=value, for instance reward.velocity.weight=0.08.")
     try:
         return path.strip(), tomllib.loads(f"value = {value}")["value"]
-    except tomllib.TOMLDecodeError:
+    except ValueError:
         return path.strip(), value.strip()
 
 

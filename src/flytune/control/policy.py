@@ -117,6 +117,8 @@ def load_policy(path: Path) -> Policy:
     if not isinstance(header, dict) or header.get("format") != FORMAT:
         found = header.get("format") if isinstance(header, dict) else None
         raise BadInput(f"{path}: is not a flytune policy (format {found!r}). Allowed: {FORMAT}.")
+    if not isinstance(header.get("about", {}), dict):
+        raise BadInput(f"{path}: has a damaged header. Train it again.")
     if header.get("observation") != observation.LAYOUT:
         raise BadInput(
             f"{path}: was trained on another observation, {header.get('observation')!r}. "

@@ -108,6 +108,11 @@ class RunDirectory:
         _write_text(self.path / "run.json", json.dumps(facts, indent=2) + "\n")
 
 
+def resume_command(path: Path, trainer: str, seed: int) -> str:
+    """What to type to go on with an interrupted run."""
+    return f"flytune train {path / 'task.toml'} --trainer {trainer} --seed {seed} --out {path} --resume"
+
+
 def read_facts(directory: Path) -> dict[str, Any]:
     """The content of a run's run.json.
 
@@ -116,13 +121,16 @@ def read_facts(directory: Path) -> dict[str, Any]:
     """
     path = directory / "run.json"
     try:
-        return json.loads(path.read_text(encoding="utf-8"))
+        facts = json.loads(path.read_text(encoding="utf-8"))
     except OSError:
         raise BadInput(
             f"{directory}: is not a run directory (no run.json). Give one that `flytune train` wrote."
         ) from None
     except ValueError:
         raise BadInput(f"{path}: is damaged. Train again into another directory.") from None
+    if not isinstance(facts, dict) or not {"trainer", "seed", "versions", "machine", "command", "time"} <= set(facts):
+        raise BadInput(f"{path}: is damaged. Train again into another directory.")
+    return facts
 
 
 def _facts(task: Task, trainer: str, seed: int) -> dict[str, Any]:
@@ -143,14 +151,19 @@ def _facts(task: Task, trainer: str, seed: int) -> dict[str, Any]:
 
 def _commit() -> str | None:
     """The commit flytune was run from, or None where it is not run from a checkout."""
-    here = Path(__file__).resolve().parent
-    try:
-        answer = subprocess.run(
-            ["git", "-C", str(here), "rev-parse", "HEAD"], capture_output=True, text=True, timeout=5, check=False
-        )
-    except (OSError, subprocess.TimeoutExpired):
-        return None
-    return answer.stdout.strip() or None
+    here = Path(__file__).resolve()
+    environment = {name: value for name, value in os.environ.items() if not name.startswith("GIT_")}
+
+    def git(*arguments: str) -> str | None:
+        command = ["git", "-C", str(here.parent), *arguments]
+        try:
+            answer = subprocess.run(command, capture_output=True, text=True, timeout=5, check=False, env=environment)
+        except (OSError, subprocess.TimeoutExpired):
+            return None
+        return answer.stdout.strip() if answer.returncode == 0 else None
+
+    # a package installed inside somebody else's repository is not part of it
+    return git("rev-parse", "HEAD") if git("ls-files", "--error-unmatch", here.name) else None
 
 
 def _first_difference(first: Any, second: Any, path: str = "") -> str | None:

@@ -2,13 +2,14 @@
 
 import dataclasses
 import json
+import os
 from pathlib import Path
 from typing import Any
 
 from flytune.control.controller import Controller
 from flytune.control.policy import load_policy
 from flytune.errors import BadInput
-from flytune.learn.directory import read_facts
+from flytune.learn.directory import read_facts, resume_command
 from flytune.task.task import Task, load_task, read_task_text
 
 
@@ -30,9 +31,9 @@ def find_pilot(who: str) -> Pilot:
         BadInput: there is no such thing, or it cannot be used.
     """
     path = Path(who)
-    if path.is_dir():
+    if os.path.isdir(who):  # unlike Path.is_dir, also where the name is too long to be one
         return _from_run(who, path)
-    if path.suffix == ".safetensors" or path.is_file():
+    if path.suffix == ".safetensors" or os.path.isfile(who):
         policy = load_policy(path)
         about = {key: str(value) for key, value in policy.about.items() if key != "task_toml"}
         return Pilot(name=who, controller=policy, task=_task_of(who, policy.about), metrics=None, about=about)
@@ -44,16 +45,17 @@ def find_pilot(who: str) -> Pilot:
 def _from_run(who: str, path: Path) -> Pilot:
     facts = read_facts(path)
     if not (path / "policy.safetensors").exists():
-        raise BadInput(
-            f"{who}: its training has not ended. Go on with: flytune train {path / 'task.toml'} --out {path} --resume"
-        )
+        begun = (path / "checkpoint" / "learner.safetensors").exists()
+        remedy = f"Go on with: {resume_command(path, facts['trainer'], facts['seed'])}" if begun else "Train it again."
+        raise BadInput(f"{who}: its training has not ended. {remedy}")
     policy = load_policy(path / "policy.safetensors")
     about = {
         "trainer": f"{facts['trainer']}, seed {facts['seed']}",
-        "environment steps": f"{facts.get('steps', 0):,}",
-        "training time": f"{facts.get('seconds', 0):.0f} s on {facts['machine']['cores']} cores ({facts['device']})",
-        "versions": ", ".join(f"{name} {version}" for name, version in facts["versions"].items()),
-        "command": " ".join(facts["command"]),
+        "environment steps": str(facts.get("steps", 0)),
+        "training time": f"{facts.get('seconds', 0)} s",
+        "machine": ", ".join(f"{name} {value}" for name, value in dict(facts["machine"]).items()),
+        "versions": ", ".join(f"{name} {version}" for name, version in dict(facts["versions"]).items()),
+        "command": " ".join(map(str, facts["command"])),
         "started": facts["time"],
     }
     metrics = _read_metrics(path / "metrics.jsonl")
@@ -64,9 +66,12 @@ def _read_metrics(path: Path) -> list[dict[str, Any]] | None:
     if not path.exists():
         return None
     try:
-        return [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
-    except ValueError as error:
+        rows = [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
+        if not all(isinstance(row, dict) for row in rows):
+            raise ValueError("a line is no object")
+    except (OSError, ValueError) as error:
         raise BadInput(f"{path}: is damaged ({error}). Remove it to go without the learning curve.") from None
+    return rows
 
 
 def _task_of(who: str, about: dict[str, Any]) -> Task | None:

@@ -18,7 +18,7 @@ import numpy as np
 from flytune.control.policy import Policy
 from flytune.errors import BadInput, Diverged, Interrupted
 from flytune.learn import apg, ppo
-from flytune.learn.directory import RunDirectory
+from flytune.learn.directory import RunDirectory, resume_command
 from flytune.task.task import Task, write_task
 from flytune.task.termination import causes
 
@@ -137,10 +137,15 @@ class _Clock:
     """Time and speed of a training; the first update compiles, so speed is judged by the others."""
 
     def __init__(self, task: Task, trainer: str, seed: int, rows: list[dict[str, Any]]) -> None:
+        self.trainer, self.seed = trainer, seed
         self.label = f"{task.name}  {trainer}  seed {seed}"
         self.updates, self.samples = total_updates(task, trainer), steps_per_update(task, trainer)
         self.first, self.before = len(rows), rows[-1]["seconds"] if rows else 0.0
         self.started = self.compiled = time.monotonic()
+
+    def resume(self, path: Path) -> str:
+        """What to type to go on with the run in `path`."""
+        return resume_command(path, self.trainer, self.seed)
 
     def seconds(self, number: int) -> float:
         """Seconds of training up to the end of update `number`, which is now."""
@@ -193,7 +198,7 @@ def _loop(
                 raise KeyboardInterrupt
             raise Interrupted(
                 f"interrupted after {row['steps']} environment steps; checkpoint saved in "
-                f"{directory.path / 'checkpoint'}. Go on with --out {directory.path} --resume"
+                f"{directory.path / 'checkpoint'}. Go on with: {clock.resume(directory.path)}"
             )
     if directory is not None:
         directory.checkpoint(learner, rows)

@@ -52,14 +52,14 @@ def fly(
         Diverged: the controller answered a finite observation with an action that is not finite.
     """
     duration = task.duration if duration is None else duration
-    if trials < 1:
-        raise BadInput(f"trials: {trials} is not allowed. Allowed: a whole number, 1 or more.")
+    if not 1 <= trials <= 100_000:
+        raise BadInput(f"trials: {trials} is not allowed. Allowed: a whole number, 1 to 100000.")
     if not (np.isfinite(duration) and 0.5 < duration <= 3600):
         raise BadInput(f"duration: {duration} is not allowed. Allowed: above 0.5 to 3600 s.")
     if starts not in EVALUATION_STARTS:
         raise BadInput(f"starts: {starts!r} is not allowed. Allowed: {', '.join(EVALUATION_STARTS)}.")
-    if seed < 0:
-        raise BadInput(f"seed: {seed} is not allowed. Allowed: a whole number, 0 or more.")
+    if not 0 <= seed < 2**32:
+        raise BadInput(f"seed: {seed} is not allowed. Allowed: a whole number, 0 to {2**32 - 1}.")
     steps = round(duration / CONTROL_PERIOD)
     keys = jax.vmap(partial(jax.random.fold_in, jax.random.key(seed)))(jnp.arange(trials))
     record = _fly_all(controller, task, EVALUATION_STARTS[starts], keys, steps)

@@ -1,10 +1,12 @@
 """Task: everything that is wanted, in one file."""
 
+import os
+import re
 from importlib import resources
 from pathlib import Path
 from typing import Annotated, Any
 
-from annotated_types import Ge, Gt, Unit
+from annotated_types import Ge, Gt, Le, Unit
 
 from flytune import document
 from flytune.document import Real, Whole
@@ -24,8 +26,10 @@ class Task:
     """What a pilot is asked to do, with which vehicle, and how it is trained for it."""
 
     name: str = label(default="custom")
-    horizon: Annotated[Whole, Ge(1), Unit("control steps of 0.01 s")]  # a training episode is truncated after these
-    duration: Annotated[Real, Gt(0.5), Unit("s")] = label(default=10.0)  # of a trial in evaluation
+    horizon: Annotated[
+        Whole, Ge(1), Le(1_000_000), Unit("control steps of 0.01 s")
+    ]  # a training episode is truncated after these
+    duration: Annotated[Real, Gt(0.5), Le(3600), Unit("s")] = label(default=10.0)  # of a trial in evaluation
     target: Target
     initial_state: InitialState
     noise: ObservationNoise
@@ -46,6 +50,8 @@ class Task:
         """What makes the numbers impossible together, or None."""
         if not self.reward:
             return "reward: no term. Allowed: one or more tables [reward.NAME]."
+        if not re.fullmatch(r"[\w .+-]{1,100}", self.name):
+            return f"name: {self.name[:100]!r} cannot name a run. Allowed: up to 100 letters, digits and . _ + - signs."
         return None
 
 
@@ -70,7 +76,7 @@ def load_task(task: str | Path, edits: dict[str, Any] | None = None) -> Task:
         with resources.as_file(resources.files("flytune.task") / "presets" / f"{name}.toml") as path:
             data = {"name": name, **document.load(path)}
         where = ""
-    elif name.endswith(".toml") or Path(name).is_file():
+    elif name.endswith(".toml") or os.path.isfile(name):
         data = {"name": Path(name).stem, **document.load(Path(name))}
         where = name
     else:
@@ -114,5 +120,7 @@ def _edited(data: dict[str, Any], path: str, value: Any) -> dict[str, Any]:
     data = document.edit(data, path, value)
     owner, field = (data["vehicle"], path[len("vehicle.") :]) if path.startswith("vehicle.") else (data, path)
     if not path.startswith(("name", "sources", "vehicle.name", "vehicle.sources")):
-        owner["sources"] = {**owner.get("sources", {}), field: "set by the user"}
+        sources = owner.get("sources", {})
+        if isinstance(sources, dict):  # else it is refused, with its name, when the task is read
+            owner["sources"] = {**sources, field: "set by the user"}
     return data

@@ -11,7 +11,7 @@ from flytune.task.initial_state import InitialState
 
 Share = Annotated[Real, Ge(0), Le(1), Unit("1")]
 Positive = Annotated[Real, Gt(0), Unit("1")]
-Count = Annotated[Whole, Ge(1)]
+Count = Annotated[Whole, Ge(1), Le(1_000_000)]
 
 
 @pytree
@@ -19,8 +19,8 @@ class PpoSettings:
     """Proximal policy optimisation (Schulman et al. 2017), by default the paper's (R16 to R18)."""
 
     steps: Annotated[Whole, Ge(1), Unit("environment steps")] = 6_000_000  # R18
-    environments: Annotated[Whole, Ge(1)] = 128  # reading of R18: 128 x 128 gives the samples of 4 x 4096
-    rollout: Annotated[Whole, Ge(1), Unit("steps per environment")] = 128
+    environments: Count = 128  # reading of R18: 128 x 128 gives the samples of 4 x 4096
+    rollout: Annotated[Whole, Ge(1), Le(1_000_000), Unit("steps per environment")] = 128
     epochs: Count = 12  # R17
     minibatch: Annotated[Whole, Ge(2), Unit("samples")] = 128  # R17
     learning_rate: Annotated[Real, Gt(0), Unit("1")] = 2e-4  # R17
@@ -59,7 +59,7 @@ class ApgSettings:
     )
     updates: Count = 300
     environments: Count = 64
-    window: Annotated[Whole, Ge(1), Unit("steps")] = 250  # what one gradient looks through
+    window: Annotated[Whole, Ge(1), Le(1_000_000), Unit("steps")] = 250  # what one gradient looks through
     learning_rate: Annotated[Real, Gt(0), Unit("1")] = 5e-3
     final_learning_rate: Share = 0.02  # as a share of the first, reached by a cosine
     momentum: Annotated[Real, Ge(0), Lt(1), Unit("1")] = 0.7  # Adam's b1
