@@ -251,14 +251,14 @@ def test_a_pilot_that_never_breaks_is_not_accused(quick):
 @pytest.mark.parametrize(
     ("options", "start"),
     [
-        ({"trials": 0}, "trials: 0 is not allowed. Allowed: a whole number, 1 or more."),
+        ({"trials": 0}, "trials: 0 is not allowed. Allowed: a whole number, 1 to 100000."),
         ({"trials": -3}, "trials: -3 is not allowed."),
         ({"duration": math.nan}, "duration: nan is not allowed. Allowed: above 0.5"),
         ({"duration": math.inf}, "duration: inf is not allowed."),
         ({"duration": 0.3}, "duration: 0.3 is not allowed."),
         ({"duration": 0.5}, "duration: 0.5 is not allowed."),
         ({"starts": "easy"}, "starts: 'easy' is not allowed. Allowed: paper, clear."),
-        ({"seed": -1}, "seed: -1 is not allowed. Allowed: a whole number, 0 or more."),
+        ({"seed": -1}, "seed: -1 is not allowed. Allowed: a whole number, 0 to 4294967295."),
     ],
 )
 def test_an_argument_out_of_range_is_refused_in_one_line(quick, options, start):
