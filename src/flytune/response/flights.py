@@ -8,6 +8,8 @@ import numpy as np
 
 from flytune.errors import BadInput
 
+CRASH_DISTANCE = 10.0  # m from the target; a vehicle beyond it has crashed
+
 STATE_COLUMNS = {
     "position": ("x", "y", "z"),
     "attitude": ("qx", "qy", "qz", "qw"),

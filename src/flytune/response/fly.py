@@ -12,14 +12,13 @@ from flytune.errors import BadInput, Diverged
 from flytune.physics import dynamics
 from flytune.physics.dynamics import CONTROL_PERIOD, State
 from flytune.physics.rotation import safe_norm
-from flytune.response.flights import Flights
+from flytune.response.flights import CRASH_DISTANCE, Flights
 from flytune.task.initial_state import EVALUATION_STARTS, InitialState
 from flytune.task.observation import draw_noise, observe
 from flytune.task.situation import position_error, situation
 from flytune.task.task import Task
 from flytune.task.termination import margins
 
-BALL = 10.0  # m around the target; a vehicle outside it has crashed
 Starts = Literal["clear", "paper"]
 
 
@@ -127,4 +126,4 @@ def _fly_one(controller: Any, task: Task, starts: InitialState, key: jax.Array, 
 def _is_lost(task: Task, state: State) -> jax.Array:
     distance = safe_norm(position_error(task.target, state.position))
     body = jnp.stack([*state.position, *state.attitude, *state.velocity, *state.body_rate])
-    return ~((distance <= BALL) & jnp.all(jnp.isfinite(body)))
+    return ~((distance <= CRASH_DISTANCE) & jnp.all(jnp.isfinite(body)))

@@ -7,14 +7,12 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from flytune.response import bounds, metrics
-from flytune.response.flights import Flights
+from flytune.response.flights import CRASH_DISTANCE, Flights
 from flytune.response.statistics import finite, median, summary
-from flytune.response.table import response_line, response_table
+from flytune.response.table import AXES, response_line, response_table
 
-AXES = ("x", "y", "z", "yaw")
 CHANNELS = (*AXES, "position")
 SECONDARY_BANDS = {"2%": 0.02, "5%": 0.05}  # of each trial's own step
-CRASH_DISTANCE = 10.0  # m from the target
 
 TIMES = ("median", "p25", "p75", "p95")
 OVERSHOOTS = ("median", "p75", "p95")
