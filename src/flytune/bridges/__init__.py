@@ -1,0 +1,1 @@
+"""Other people's worlds and interfaces: Gymnasium, Stable-Baselines3, PyBullet, MuJoCo."""
