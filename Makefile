@@ -1,12 +1,13 @@
 # make demo    train the baseline controller, fly 100 trials, write report.html
 # make test    the test suite        make test-slow   the trainings it leaves out
+# make test-sb3  the tests that need PyTorch (a large download)
 # make check   lint, types, layers   make pins        renew the pinned requirements
 PYTHON ?= python3
 BIN := .venv/bin
 WORKERS ?= 2
 export PIP_DISABLE_PIP_VERSION_CHECK = 1
 
-.PHONY: demo test test-slow check pins clean
+.PHONY: demo test test-slow test-sb3 check pins clean
 
 demo: .venv/base.stamp
 	@run=$$($(BIN)/flytune train baseline | tail -n 1) && \
@@ -18,6 +19,11 @@ test: .venv/dev.stamp
 
 test-slow: .venv/dev.stamp
 	$(BIN)/python -m pytest -m slow -n $(WORKERS)
+
+# TORCH says what to install where torch is missing; set PIP_INDEX_URL or PIP_FIND_LINKS to take its smaller CPU build
+TORCH ?= torch==2.13.0
+test-sb3: .venv/sb3.stamp
+	$(BIN)/python -m pytest tests/sb3 -n $(WORKERS)
 
 check: .venv/dev.stamp
 	$(BIN)/ruff check .
@@ -35,11 +41,20 @@ check: .venv/dev.stamp
 	$(BIN)/python -m pip install --quiet --require-hashes -r requirements/dev.txt
 	touch $@
 
+.venv/sb3.stamp: requirements/sb3.txt .venv/dev.stamp
+	$(BIN)/python -c "import torch" 2>/dev/null || $(BIN)/python -m pip install --quiet "$(TORCH)"
+	$(BIN)/python -m pip install --quiet --no-deps --require-hashes -r requirements/sb3.txt
+	touch $@
+
 PIN := $(BIN)/pip-compile --quiet --generate-hashes --allow-unsafe --strip-extras --no-header --no-annotate \
        --no-emit-index-url --no-emit-trusted-host --no-emit-find-links --no-emit-options
+EXTRAS := $(foreach extra,build dev gymnasium mujoco onnx optuna pybullet tensorboard,--extra $(extra))
 pins:
 	$(PIN) --extra build -o requirements/base.txt pyproject.toml
-	$(PIN) --extra build --extra dev -c requirements/base.txt -o requirements/dev.txt pyproject.toml
+	$(PIN) $(EXTRAS) -c requirements/base.txt -o requirements/dev.txt pyproject.toml
+	rm -rf build/sb3 && $(BIN)/python -m pip download --quiet --no-deps -d build/sb3 stable-baselines3
+	cd build/sb3 && for file in *.whl; do echo "$$file" | sed -E 's/_/-/; s/-py3.*/ \\/; s/-([0-9.]+ )/==\1/' && \
+		sha256sum "$$file" | sed -E 's/ .*//; s/^/    --hash=sha256:/'; done > ../../requirements/sb3.txt
 
 clean:
 	rm -rf .venv .jax_cache runs report.html

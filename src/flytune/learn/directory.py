@@ -60,7 +60,7 @@ class RunDirectory:
                 f"not {trainer}, seed {seed}. Give the same, or another directory."
             )
         before, now = document.plain(load_task(self.path / "task.toml")), document.plain(task)
-        if path := _first_difference(before, now):
+        if path := first_difference(before, now):
             raise BadInput(
                 f"resume: {self.path} was trained with another {path}. Give {self.path}/task.toml as the task."
             )
@@ -166,12 +166,13 @@ def _commit() -> str | None:
     return git("rev-parse", "HEAD") if git("ls-files", "--error-unmatch", here.name) else None
 
 
-def _first_difference(first: Any, second: Any, path: str = "") -> str | None:
+def first_difference(first: Any, second: Any, path: str = "") -> str | None:
+    """The path of the first value in which two nested tables differ, names and sources apart; None where none does."""
     if isinstance(first, dict) and isinstance(second, dict):
         for name in sorted(set(first) | set(second)):
             if name in ("name", "sources"):
                 continue
-            if found := _first_difference(first.get(name), second.get(name), f"{path}.{name}" if path else name):
+            if found := first_difference(first.get(name), second.get(name), f"{path}.{name}" if path else name):
                 return found
         return None
     return None if first == second else path
