@@ -1,0 +1,108 @@
+"""Classical pilots by name, their gains read from gains/NAME.toml: two sets each, textbook and tuned."""
+
+import math
+from importlib import resources
+from pathlib import Path
+from typing import Any, Literal, get_args
+
+from flytune import document
+from flytune.control.controller import Controller
+from flytune.control.geometric import Geometric, GeometricGains
+from flytune.control.lqr import LqrGains, make_lqr
+from flytune.control.pid import Pid, PidGains
+from flytune.control.steering import tighter
+from flytune.errors import BadInput
+from flytune.pytree import label, pytree
+from flytune.task.task import Task
+from flytune.task.termination import MaximumBodyRate, MaximumTilt
+
+Which = Literal["tuned", "textbook"]
+AnyGains = PidGains | GeometricGains | LqrGains
+
+
+@pytree
+class PidFile:
+    """gains/pid.toml."""
+
+    textbook: PidGains
+    tuned: PidGains
+    sources: dict[str, str] = label(default_factory=dict)
+
+
+@pytree
+class GeometricFile:
+    """gains/geometric.toml."""
+
+    textbook: GeometricGains
+    tuned: GeometricGains
+    sources: dict[str, str] = label(default_factory=dict)
+
+
+@pytree
+class LqrFile:
+    """gains/lqr.toml."""
+
+    textbook: LqrGains
+    tuned: LqrGains
+    sources: dict[str, str] = label(default_factory=dict)
+
+
+FILES: dict[str, Any] = {"geometric": GeometricFile, "lqr": LqrFile, "pid": PidFile}
+CLASSICAL = tuple(FILES)
+
+
+def classical_pilot(name: str, task: Task, gains: Which = "tuned") -> Controller:
+    """The classical pilot of a name for a task's vehicle, target heading and bounds.
+
+    Args:
+        name: `pid`, `geometric` or `lqr`.
+        task: what it will fly. Its bounds on speed, tilt and body rate become the pilot's limits, less the margin
+            that the gains leave; a bound the task does not have limits nothing.
+        gains: `tuned` or `textbook`.
+
+    Raises:
+        BadInput: no such pilot or gains.
+    """
+    if gains not in get_args(Which):
+        raise BadInput(f"gains: {gains!r} is not allowed. Allowed: {', '.join(get_args(Which))}.")
+    return pilot_with(getattr(read_gains(name), gains), task)
+
+
+def read_gains(name: str, path: Path | None = None) -> PidFile | GeometricFile | LqrFile:
+    """Both sets of gains of a pilot, from a file or, where None, from the one that ships.
+
+    Raises:
+        BadInput: no such pilot, or not its gains; one line that names the field.
+    """
+    if name not in FILES:
+        hint = document.nearest(name, list(CLASSICAL))
+        raise BadInput(
+            f"{name}: no such classical pilot. Allowed: {', '.join(CLASSICAL)}."
+            + (f" Did you mean {hint}?" if hint else "")
+        )
+    if path is not None:
+        return document.read(FILES[name], document.load(path), str(path))
+    with resources.as_file(resources.files("flytune.control") / "gains" / f"{name}.toml") as shipped:
+        return document.read(FILES[name], document.load(shipped), f"gains/{name}.toml")
+
+
+def pilot_with(gains: AnyGains, task: Task) -> Controller:
+    """The pilot whose gains these are, for a task.
+
+    Raises:
+        BadInput: the gains give no stabilising feedback.
+    """
+    share, ends = float(gains.bound_share), task.termination.values()
+    tilts = [math.radians(float(end.bound_deg)) for end in ends if isinstance(end, MaximumTilt)]
+    rates = [math.radians(float(end.bound_deg_per_s)) for end in ends if isinstance(end, MaximumBodyRate)]
+    limits: dict[str, Any] = {
+        "target_yaw": float(task.target.yaw),
+        "speed_limit": None if task.speed_bound is None else share * task.speed_bound,
+        "tilt_limit": tighter(float(gains.largest_tilt), share * min(tilts) if tilts else None),
+        "body_rate_limit": share * min(rates) if rates else None,
+    }
+    if isinstance(gains, LqrGains):
+        return make_lqr(task.vehicle, gains, **limits)
+    if isinstance(gains, GeometricGains):
+        return Geometric(gains=gains, vehicle=task.vehicle, **limits)
+    return Pid(gains=gains, vehicle=task.vehicle, **limits)

@@ -1,0 +1,190 @@
+"""A linear quadratic regulator: the vehicle linearised about hover, and the best linear feedback for it."""
+
+from typing import Annotated, Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from annotated_types import Gt, Le, Unit
+from jaxtyping import Array, Float
+from scipy.linalg import solve_discrete_are
+
+from flytune.control.actuation import (
+    PITCH,
+    YAW,
+    action_for,
+    allocate,
+    estimated_rotor_speed,
+    hovering_rotors,
+    mixed,
+)
+from flytune.control.sensing import Sensed, heading, sense, wrapped
+from flytune.control.steering import shortened, slowed
+from flytune.document import Real
+from flytune.errors import BadInput
+from flytune.physics import dynamics, rotation
+from flytune.physics.components import Components, pack, unpack
+from flytune.physics.vehicle import Vehicle
+from flytune.pytree import pytree
+
+STATES = 16
+STATE = (
+    "position error (3) [m] and velocity (3) [m/s] in axes that turn with the heading, roll, pitch and yaw error [rad], "
+    "body rate (3) [rad/s], rotor speed (4) in units of the action"
+)
+Metres = Annotated[Real, Gt(0), Unit("m")]
+Speed = Annotated[Real, Gt(0), Unit("m/s")]
+Radians = Annotated[Real, Gt(0), Unit("rad")]
+Rate = Annotated[Real, Gt(0), Unit("rad/s")]
+
+
+@pytree
+class LqrGains:
+    """The largest deviations that are acceptable: each weight is the inverse of its square (Bryson's rule)."""
+
+    horizontal_error: Metres
+    vertical_error: Metres
+    horizontal_speed: Speed
+    vertical_speed: Speed
+    tilt: Radians
+    yaw_error: Radians
+    tilt_rate: Rate
+    yaw_rate: Rate
+    action: Annotated[Real, Gt(0), Unit("1")]
+    largest_yaw_error: Radians  # fed to the law; a larger one is cut to it
+    largest_tilt: Annotated[Real, Gt(0), Le(1), Unit("rad")]
+    bound_share: Annotated[Real, Gt(0), Le(1), Unit("1")]  # of the task's bounds on speed, tilt and rate that is used
+
+
+@pytree
+class Lqr:
+    """The feedback u = -K x, for one vehicle and one target heading; it remembers the rotor speeds it believes in."""
+
+    gain: Float[Array, "4 16"]  # K: action per unit of each state
+    gains: LqrGains
+    vehicle: Vehicle
+    target_yaw: Any  # rad
+    speed_limit: Any  # m/s, or None
+    tilt_limit: Any  # rad
+    body_rate_limit: Any  # rad/s, or None
+
+    def initial_memory(self) -> Components:
+        """Rotors at hover speed, in rpm."""
+        return hovering_rotors(self.vehicle)
+
+    def act(self, memory: Components, observation: Float[Array, "17"]) -> tuple[Components, Float[Array, "4"]]:
+        """The action of one observation, see `Controller`.
+
+        The linear law gives small changes of thrust, f_i = f_hover (1 + 2 action_scale u_i). The rotor speeds for these
+        come from the exact mixer, which also decides what gives way where a rotor is at its limit.
+        """
+        sensed = sense(self.target_yaw, observation)
+        rotors = estimated_rotor_speed(self.vehicle, memory, sensed.last_action)
+        change = unpack(-self.gain @ pack(self.deviation(sensed, rotors)))
+        hover = self.vehicle.hover_rotor_speed_rpm
+        squares = tuple(hover**2 * (1 + 2 * self.vehicle.action_scale * u) for u in change)
+        thrust, torque = mixed(self.vehicle, squares)
+        return rotors, action_for(self.vehicle, rotors, allocate(self.vehicle, thrust, torque))
+
+    def deviation(self, sensed: Sensed, rotors: Components) -> Components:
+        """The 16 states that are fed back, see `STATE`, with position and yaw errors cut to what the limits allow."""
+        yaw = heading(sensed.attitude)
+        tilted = rotation.multiply(rotation.from_euler(jnp.zeros(()), jnp.zeros(()), -yaw), sensed.attitude)
+        position = self.reachable(_turned(sensed.position_error, yaw))
+        largest = self.gains.largest_yaw_error
+        if self.body_rate_limit is not None:
+            largest = jnp.minimum(largest, self.body_rate_limit / self._ratio(YAW, 8, 11))
+        yaw_error = jnp.clip(wrapped(yaw - self.target_yaw), -largest, largest)
+        hover = self.vehicle.hover_rotor_speed_rpm
+        speeds = ((speed / hover - 1) / self.vehicle.action_scale for speed in rotors)
+        velocity = _turned(sensed.velocity, yaw)
+        return *position, *velocity, 2 * tilted[0], 2 * tilted[1], yaw_error, *sensed.body_rate, *speeds
+
+    def reachable(self, position_error: Components) -> Components:
+        """The position error in m, cut until neither the speed nor the tilt that it asks for exceeds its limit."""
+        horizontal, vertical = self._ratio(PITCH, 0, 3), self._ratio((1, 1, 1, 1), 2, 5)
+        tilt_per_metre = jnp.abs(self._ratio(PITCH, 0, 7))
+        error = slowed(position_error, (horizontal, horizontal, vertical), self.speed_limit)
+        return *shortened(error[:2], self.tilt_limit / tilt_per_metre), error[2]
+
+    def _ratio(self, motors: tuple[int, ...], state: int, to: int) -> Any:
+        """How one state weighs against another in what the motors do together."""
+        row = jnp.asarray(motors, float) @ self.gain
+        return row[state] / row[to]
+
+
+def make_lqr(vehicle: Vehicle, gains: LqrGains, **limits: Any) -> Lqr:
+    """The regulator of a vehicle.
+
+    Args:
+        vehicle: what is flown.
+        gains: largest acceptable deviations.
+        limits: `target_yaw`, `speed_limit`, `tilt_limit`, `body_rate_limit`, see `Lqr`.
+
+    Raises:
+        BadInput: no stabilising feedback could be worked out.
+    """
+    return Lqr(gain=jnp.asarray(feedback(vehicle, gains), jnp.float32), gains=gains, vehicle=vehicle, **limits)
+
+
+def feedback(vehicle: Vehicle, gains: LqrGains) -> Float[np.ndarray, "4 16"]:
+    """The gain K that minimises sum(x' Q x + u' R u) for x_{k+1} = A x_k + B u_k at the control period.
+
+        P = A' P A - A' P B (R + B' P B)^-1 B' P A + Q;    K = (R + B' P B)^-1 B' P A
+
+    Raises:
+        BadInput: the Riccati equation has no stabilising solution in floating point.
+    """
+    a, b = linearised(vehicle)
+    q, r = weights(gains)
+    try:
+        p = solve_discrete_are(a, b, q, r)
+    except np.linalg.LinAlgError as error:
+        raise BadInput(f"lqr: no feedback for these weights ({error}). Bring them nearer to the textbook's.") from None
+    return np.linalg.solve(r + b.T @ p @ b, b.T @ p @ a)
+
+
+def weights(gains: LqrGains) -> tuple[np.ndarray, np.ndarray]:
+    """Q [16, 16] and R [4, 4]: one over the square of each largest acceptable deviation; rotor speeds cost nothing.
+
+    Source: Bryson and Ho, "Applied Optimal Control", 1975, section 5.2.
+    """
+    g = gains
+    largest = [g.horizontal_error] * 2 + [g.vertical_error] + [g.horizontal_speed] * 2 + [g.vertical_speed]
+    largest += [g.tilt] * 2 + [g.yaw_error] + [g.tilt_rate] * 2 + [g.yaw_rate]
+    return np.diag([float(v) ** -2 for v in largest] + [0.0] * 4), np.eye(4) * float(g.action) ** -2
+
+
+def linearised(vehicle: Vehicle) -> tuple[np.ndarray, np.ndarray]:
+    """A [16, 16] and B [16, 4] of one control period about hover, see `STATE`: the derivative of the very step flown.
+
+    The motors' lag and the drag are in it. An action latency is not.
+    """
+
+    def after(x: jax.Array, u: jax.Array) -> jax.Array:
+        state = dynamics.hovering(vehicle, (0.0, 0.0, 0.0))
+        parts = unpack(x)
+        state = dynamics.State(
+            position=parts[:3],
+            velocity=parts[3:6],
+            attitude=rotation.exponential(parts[6:9]),
+            body_rate=parts[9:12],
+            rotor_speed_rpm=tuple(hover * (1 + vehicle.action_scale * r) for r in parts[12:]),
+            pending_actions=jnp.zeros((0, 4)),
+        )
+        end = dynamics.step(vehicle, state, u)
+        speeds = tuple((speed / hover - 1) / vehicle.action_scale for speed in end.rotor_speed_rpm)
+        angles = tuple(2 * part for part in end.attitude[:3])
+        return pack((*end.position, *end.velocity, *angles, *end.body_rate, *speeds))
+
+    hover = vehicle.hover_rotor_speed_rpm
+    a, b = jax.jit(jax.jacrev(after, argnums=(0, 1)))(jnp.zeros(STATES), jnp.zeros(4))
+    return np.asarray(a, np.float64), np.asarray(b, np.float64)
+
+
+def _turned(vector: Components, yaw: Any) -> Components:
+    """A vector of the inertial frame in axes turned by the heading."""
+    x, y, z = vector
+    c, s = jnp.cos(yaw), jnp.sin(yaw)
+    return c * x + s * y, c * y - s * x, z
+
