@@ -1,0 +1,207 @@
+"""A policy that Stable-Baselines3 trained elsewhere, read from the .zip its `model.save` wrote, without trusting it."""
+
+import collections
+import io
+import json
+import math
+import pickle
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from flytune.control.policy import Network, Policy
+from flytune.errors import BadInput
+from flytune.task.observation import SIZE
+
+LARGEST = 16 * 2**20  # bytes of what is read; the paper's actor and critic take 50 kB
+LARGEST_INDEX = 2**16  # bytes of the list of tensors; 2 kB in the paper's
+ENTRIES = 1000  # files in an archive; SB3 writes 6, and one per tensor inside policy.pth
+HARMLESS = {"net_arch", "activation_fn", "ortho_init", "log_std_init", "optimizer_class", "optimizer_kwargs"}
+REMEDY = "Give a PPO model with an MlpPolicy, tanh, and flytune's 17 observations and 4 actions, from model.save."
+
+
+def load_sb3(path: Path) -> Policy:
+    """The policy of a Stable-Baselines3 PPO (or A2C) model: the mean of its Gaussian, clipped into [-1, 1].
+
+    Weights only: no object of the file is unpickled, and no flag allows it. `data` is read as the JSON that it also
+    is, and the list of tensors by a reader that knows three names and has harmless stand-ins for them. `torch.load`
+    is not used, since crafted files could run code through it also with `weights_only=True` (CVE-2025-32434 before
+    torch 2.6, CVE-2026-24747 before 2.10); so neither torch nor Stable-Baselines3 need be installed.
+
+    Whether observations were scaled by VecNormalize cannot be seen in this file; such a policy does not fly here.
+
+    Raises:
+        BadInput: missing, damaged, foreign, too large, of another architecture or size, or not finite.
+    """
+    try:
+        with zipfile.ZipFile(path) as archive:
+            _check_size(archive, math.inf)
+            about = json.loads(_member(archive, "data"))
+            version = _member(archive, "_stable_baselines3_version").decode("ascii").strip()
+            tensors = _tensors(_member(archive, "policy.pth"))
+    except FileNotFoundError:
+        raise BadInput(f"{path}: no such file. {REMEDY}") from None
+    except BadInput as error:
+        raise BadInput(f"{path}: {error} {REMEDY}") from None
+    # a damaged archive breaks in as many ways as zipfile, json and pickle have lines
+    except Exception as error:
+        reason = " ".join(str(error).split())[:200] or type(error).__name__
+        raise BadInput(f"{path}: is not a Stable-Baselines3 model ({reason}). {REMEDY}") from None
+    problem = _unknown_kind(about) or _unknown_shape(tensors) or _not_finite(tensors)
+    if problem:
+        raise BadInput(f"{path}: {problem} {REMEDY}")
+    return _policy(tensors, {"trainer": "Stable-Baselines3", "version": version[:40]})
+
+
+def _check_size(archive: zipfile.ZipFile, largest: float) -> None:
+    entries = archive.infolist()
+    size = sum(entry.file_size for entry in entries)
+    if len(entries) > ENTRIES or size > largest:
+        raise BadInput(f"holds {len(entries)} entries of {size} bytes, allowed: up to {ENTRIES} of {LARGEST}.")
+
+
+def _member(archive: zipfile.ZipFile, name: str, largest: int = LARGEST) -> bytes:
+    """The bytes of one member, found by its exact name and never written anywhere."""
+    try:
+        information = archive.getinfo(name)
+    except KeyError:
+        raise BadInput(f"is not a Stable-Baselines3 model (no {name!r} in it).") from None
+    if information.file_size > largest:
+        raise BadInput(f"{name} unpacks to {information.file_size} bytes, allowed: up to {largest}.")
+    with archive.open(information) as file:
+        return file.read(largest)
+
+
+def _tensors(content: bytes) -> dict[str, np.ndarray]:
+    """The float32 tensors of a file that torch.save wrote, without torch.
+
+    The file is a zip with one folder: `data.pkl`, a pickled dictionary of tensors that name their storages, `data/KEY`,
+    the numbers of each storage, and `byteorder`.
+
+    Source: PyTorch, notes on serialization, "Serialized file format for torch.save".
+    """
+    with zipfile.ZipFile(io.BytesIO(content)) as archive:
+        _check_size(archive, LARGEST)
+        folders = {name.partition("/")[0] for name in archive.namelist()}
+        if len(folders) != 1:
+            raise BadInput(f"its policy.pth holds {len(folders)} folders, allowed: 1.")
+        folder = folders.pop()
+        if f"{folder}/byteorder" in archive.namelist() and _member(archive, f"{folder}/byteorder") != b"little":
+            raise BadInput("its policy.pth has another byte order, allowed: little.")
+        found = _Index(io.BytesIO(_member(archive, f"{folder}/data.pkl", LARGEST_INDEX))).load()
+        if not isinstance(found, dict) or not all(isinstance(value, _Tensor) for value in found.values()):
+            raise BadInput("its policy.pth holds something else than a table of tensors.")
+        keys = {tensor.storage for tensor in found.values()}
+        storages = {key: np.frombuffer(_member(archive, f"{folder}/data/{key}"), "<f4") for key in keys}
+        return {str(name): _numbers(storages[tensor.storage], tensor) for name, tensor in found.items()}
+
+
+class _Tensor:
+    """Where the numbers of a tensor lie; what torch's rebuilding function is read as."""
+
+    def __init__(self, storage: Any, offset: Any, size: Any, stride: Any, *rest: Any) -> None:
+        self.storage, self.offset, self.size, self.stride = storage, offset, size, stride
+
+
+class _Index(pickle._Unpickler):
+    """A reader of the list of tensors that can make dictionaries and `_Tensor`s, and call nothing else.
+
+    The interpreter's own, in Python: the one in C gives a file's largest memo number as much memory as it asks for.
+    """
+
+    def find_class(self, module: str, name: str) -> Any:
+        """The stand-in for one of the three names torch.save writes for a table of float32 tensors."""
+        if (module, name) == ("collections", "OrderedDict"):
+            return collections.OrderedDict
+        if (module, name) == ("torch._utils", "_rebuild_tensor_v2"):
+            # made anew each time, so that a file can change nothing that stays
+            return lambda *parts: _Tensor(*parts)  # noqa: PLW0108
+        if (module, name) == ("torch", "FloatStorage"):
+            return "float32"
+        raise BadInput(f"its policy.pth asks for {module[:60]}.{name[:60]}, allowed: tables of float32 tensors.")
+
+    def persistent_load(self, pid: Any) -> str:
+        """The key of a storage."""
+        kind, dtype, key = pid[:3]
+        if (kind, dtype) != ("storage", "float32") or not str(key).isalnum():
+            raise BadInput("its policy.pth names a storage that is none of float32.")
+        return str(key)
+
+
+def _numbers(storage: np.ndarray, tensor: _Tensor) -> np.ndarray:
+    size, offset = tuple(int(length) for length in tensor.size), int(tensor.offset)
+    number = math.prod(size)
+    if not 1 <= len(size) <= 2 or min(size) < 1 or not 0 <= offset <= storage.size - number:
+        raise BadInput(f"its policy.pth holds a tensor of shape {size} that its storage does not.")
+    if tuple(tensor.stride) != ((size[1], 1) if len(size) == 2 else (1,)):
+        raise BadInput("its policy.pth holds a tensor that is not contiguous.")
+    return storage[offset : offset + number].reshape(size)
+
+
+def _unknown_kind(about: Any) -> str | None:
+    """What `data` says that this policy could not be, or None."""
+    if not isinstance(about, dict):
+        return "has a damaged description."
+    policy, options = about.get("policy_class"), about.get("policy_kwargs")
+    module = policy.get("__module__") if isinstance(policy, dict) else None
+    if module != "stable_baselines3.common.policies" or not isinstance(options, dict):
+        return f"has a policy of its own (module {str(module)[:60]!r})."
+    if about.get("use_sde") or options.get("use_sde") or options.get("squash_output"):
+        return "explores by gSDE or squashes its output, allowed: a plain Gaussian."
+    activation = str(options.get("activation_fn", "Tanh"))[:80]
+    if activation not in ("Tanh", "<class 'torch.nn.modules.activation.Tanh'>"):
+        return f"has the activation {activation}, allowed: tanh."
+    own = set(options) - HARMLESS - {":type:", ":serialized:", "use_sde", "squash_output"}
+    if own:
+        return f"was made with policy_kwargs {str(sorted(own))[:120]}, allowed: net_arch."
+    for name, shape in (("observation_space", [SIZE]), ("action_space", [4])):
+        space = about.get(name)
+        found = space.get("_shape") if isinstance(space, dict) else None
+        if found != shape:
+            return f"has {name} {str(found)[:40]}, allowed: {shape}."
+    low, high = (str(about["action_space"].get(end)).strip("[]").split() for end in ("low", "high"))
+    if low != ["-1."] * 4 or high != ["1."] * 4:
+        return f"has actions from {low} to {high}, allowed: -1 to 1."
+    return None
+
+
+def _layers(tensors: dict[str, np.ndarray]) -> list[str]:
+    """The names of the actor's layers, first to last."""
+    hidden = [f"mlp_extractor.policy_net.{2 * index}" for index in range(len(tensors))]
+    return [*(name for name in hidden if f"{name}.weight" in tensors), "action_net"]
+
+
+def _unknown_shape(tensors: dict[str, np.ndarray]) -> str | None:
+    """What in the tensors is not the actor of an MlpPolicy, or None."""
+    critic = ("mlp_extractor.value_net.", "value_net.")
+    names, layers = {name for name in tensors if not name.startswith(critic)}, _layers(tensors)
+    if names != {"log_std", *(f"{layer}.{part}" for layer in layers for part in ("weight", "bias"))}:
+        return f"has another architecture ({str(sorted(names))[:120]})."
+    width = SIZE
+    for layer in layers:
+        weight, bias = tensors[f"{layer}.weight"].shape, tensors[f"{layer}.bias"].shape
+        if len(weight) != 2 or weight[1] != width or bias != weight[:1]:
+            return f"{layer} has shape {weight}, allowed: (outputs, {width})."
+        width = weight[0]
+    return None if width == 4 else f"gives {width} actions, allowed: 4."
+
+
+def _not_finite(tensors: dict[str, np.ndarray]) -> str | None:
+    bad = [name for name, tensor in tensors.items() if not np.all(np.isfinite(tensor))]
+    return f"{bad[0]} holds numbers that are not finite." if bad else None
+
+
+def _policy(tensors: dict[str, np.ndarray], about: dict[str, Any]) -> Policy:
+    layers = _layers(tensors)
+    return Policy(
+        actor=Network(
+            weights=tuple(jnp.asarray(tensors[f"{layer}.weight"].T) for layer in layers),
+            biases=tuple(jnp.asarray(tensors[f"{layer}.bias"]) for layer in layers),
+        ),
+        input_scale=jnp.ones(SIZE),
+        squash="clip",
+        about=about,
+    )
