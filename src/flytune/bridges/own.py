@@ -41,7 +41,7 @@ class FlytuneWorld:
             velocity=_components(body.velocity),
             body_rate=_components(body.body_rate),
             rotor_speed_rpm=_components(body.rotor_speed_rpm),
-            pending_actions=np.zeros((len(body.position), self._vehicle.action_latency_steps, 4), np.float32),
+            pending_actions=jnp.zeros((len(body.position), self._vehicle.action_latency_steps, 4)),
         )
 
         def put(old: np.ndarray, new: np.ndarray) -> np.ndarray:

@@ -1,0 +1,63 @@
+"""Rotors for simulators that know only forces: action to rotor speed, with lag and latency. NumPy, float64.
+
+The equations are those of `physics.dynamics`, written once more because a simulator in C wants plain numbers and its
+own step.
+"""
+
+import numpy as np
+from jaxtyping import Float
+
+from flytune.physics.vehicle import Vehicle
+
+SIDE = np.array([[1, -1], [-1, -1], [-1, 1], [1, 1]])  # of each motor on the x and y axis, in levers (paper R4)
+SPIN = np.array([-1, 1, -1, 1])  # sign of each motor's torque about z (paper R4)
+
+
+class Actuator:
+    """The four rotors of each of N vehicles: speeds now, and the actions on their way to them."""
+
+    def __init__(self, vehicle: Vehicle, number: int) -> None:
+        self._vehicle = vehicle
+        hover = float(vehicle.hover_rotor_speed_rpm)
+        self.rotor_speed_rpm: Float[np.ndarray, "N 4"] = np.full((number, 4), hover)
+        self._commanded = np.full((number, 4), hover)
+        self._pending = np.zeros((number, vehicle.action_latency_steps, 4))  # oldest first
+
+    def place(self, rotor_speed_rpm: Float[np.ndarray, "K 4"], which: np.ndarray | None = None) -> None:
+        """Let the rotors turn at these speeds, with no action on its way to them; see `World.place`."""
+        chosen = slice(None) if which is None else which
+        self.rotor_speed_rpm[chosen] = rotor_speed_rpm
+        self._pending[chosen] = 0.0
+
+    def command(self, action: Float[np.ndarray, "N 4"]) -> None:
+        """Take in the actions of a control period: what comes out of the latency now moves the motors.
+
+            rpm = min(hover speed * (1 + action_scale * clip(action, -1, 1)), maximum)
+
+        Source: paper R9.
+        """
+        queue = np.concatenate([self._pending, np.asarray(action, float)[:, None]], axis=1)
+        now, self._pending = queue[:, 0], queue[:, 1:]
+        vehicle = self._vehicle
+        wanted = vehicle.hover_rotor_speed_rpm * (1 + vehicle.action_scale * np.clip(now, -1.0, 1.0))
+        self._commanded = np.minimum(wanted, vehicle.maximum_rotor_speed_rpm)
+
+    def turn(self, duration: float) -> Float[np.ndarray, "N 4"]:
+        """Let `duration` seconds pass; the rotor speeds in rpm at the middle of it.
+
+        A simulator that holds its forces through a step is of second order in the lag with the speeds of the middle,
+        and of first order with those of either end.
+        """
+        middle = self._after(duration / 2)
+        self.rotor_speed_rpm = self._after(duration)
+        return middle
+
+    def _after(self, elapsed: float) -> Float[np.ndarray, "N 4"]:
+        """The exact first-order response: command + (speed - command) exp(-t / tau), see `rotor_speed_after`."""
+        rise, fall = self._vehicle.motor_rise_time_constant, self._vehicle.motor_fall_time_constant
+        now, goal = self.rotor_speed_rpm, self._commanded
+        return goal + (now - goal) * np.where(goal > now, _share_left(rise, elapsed), _share_left(fall, elapsed))
+
+
+def _share_left(time_constant: float, elapsed: float) -> float:
+    return float(np.exp(-elapsed / time_constant)) if time_constant > 0 else 0.0
