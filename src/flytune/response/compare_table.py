@@ -11,26 +11,9 @@ from flytune.response.judge import CHANNELS, Judgement
 MAY_DIFFER = ("world", "task", "vehicle")  # between pilots whose trials are the same
 LONGEST = 30  # characters of a name in the table
 
-NOTE = (
-    "Differences are medians over the trials, each with itself: infinite where one pilot settles, or flies on, and the",
-    "other does not. Intervals are for these pilots as they are; another training of the same kind would differ more.",
-)
-
-# metric -> (what a pilot does, with more, with less, with as much, unit, factor to that unit, decimals)
-WORDS = {
-    "position.settling_time": ("settles", "later", "earlier", "as early as", " s", 1.0, 2),
-    "yaw.settling_time": ("settles in yaw", "later", "earlier", "as early as", " s", 1.0, 2),
-    "position.overshoot": ("overshoots", "more", "less", "as much as", " % of the step", 100.0, 2),
-    "position.steady_state_error": ("stays", "farther off", "nearer", "as near as", " mm", 1e3, 2),
-    "yaw.steady_state_error": ("points", "farther off", "nearer", "as near as", " deg", math.degrees(1), 3),
-    "peak_speed": ("peaks", "faster", "slower", "as fast as", " m/s", 1.0, 2),
-    "action.rms": ("acts (RMS)", "harder", "more gently", "as hard as", "", 1.0, 4),
-    "action.total_variation": ("changes its action per step", "more", "less", "as much as", "", 1.0, 4),
-}
-
 HEADER = (
-    "       settled trials         settling [s]    overshoot   final error    peak     action        crossed",
-    "    x    y    z  yaw  pos   median     p95          [%]   [mm]  [deg]   [m/s]   rms  change   a bound  crashed",
+    "       settled trials         settling [s]    overshoot   final error    peak      action        crossed",
+    "    x    y    z  yaw  pos   median     p95          [%]   [mm]  [deg]   [m/s]    rms  change   a bound  crashed",
 )
 NOTE = (
     "Differences are medians over the trials, each with itself: infinite where one pilot settles, or flies on, and the",
@@ -48,12 +31,6 @@ WORDS = {
     "action.rms": ("acts (RMS)", "harder", "more gently", "as hard as", "", 1.0, 4),
     "action.total_variation": ("changes its action per step", "more", "less", "as much as", "", 1.0, 4),
 }
-
-HEADER = (
-    "                settled trials   settling time [s]   overshoot   steady-state error    peak       action      crossed",
-    "     x     y     z   yaw   pos     median      p95         [%]       [mm]     [deg]   [m/s]    rms  change    a bound"
-    "   crashed",
-)
 
 
 def comparison_table(judgements: Sequence[Judgement], reference: int, differences: Sequence[Difference]) -> str:
@@ -81,7 +58,7 @@ def _row(judgement: Judgement) -> str:
         f"{_number(position['steady_state_error']['median'], 1, 1e3):>7}"
         f"{_number(yaw['steady_state_error']['median'], 2, math.degrees(1)):>7}"
         f"{_number(told['peak_speed']['median'], 2):>8}"
-        f"{_number(action['rms'], 3):>6}{_number(action['total_variation'], 4):>8}"
+        f"{_number(action['rms'], 3):>7}{_number(action['total_variation'], 4):>8}"
         f"{np.count_nonzero(crossed):>10}{told['crashed']:>9}"
     )
 
