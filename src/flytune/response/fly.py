@@ -1,5 +1,6 @@
 """Flying: a controller, a task and a set of starts become recorded flights."""
 
+from collections.abc import Mapping
 from functools import partial
 from typing import Any, Literal
 
@@ -7,17 +8,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from flytune.bridges.worlds import make_world
 from flytune.control.controller import Controller
-from flytune.errors import BadInput, Diverged
+from flytune.errors import BadInput
 from flytune.physics import dynamics
 from flytune.physics.dynamics import CONTROL_PERIOD, State
-from flytune.physics.rotation import safe_norm
-from flytune.response.flights import CRASH_DISTANCE, Flights
+from flytune.response.flights import Flights
+from flytune.response.lockstep import fly_in_world
+from flytune.response.trial import begin, decide, is_lost, margins_along, not_finite, trial_keys
 from flytune.task.initial_state import EVALUATION_STARTS, InitialState
-from flytune.task.observation import draw_noise, observe
-from flytune.task.situation import position_error, situation
 from flytune.task.task import Task
-from flytune.task.termination import margins
 
 Starts = Literal["clear", "paper"]
 
@@ -31,10 +31,13 @@ def fly(
     starts: Starts = "clear",
     duration: float | None = None,
     who: str = "",
+    world: str = "flytune",
+    world_options: Mapping[str, Any] | None = None,
 ) -> Flights:
     """The trajectories of a controller over many trials, from rest, on noisy observations (paper R19).
 
-    Start and noise of a trial depend on (seed, trial, step) alone, so controllers can be compared on equal terms.
+    Start and noise of a trial depend on (seed, trial, step) alone, so controllers, and worlds, can be compared on
+    equal terms.
     Trials run to their end whether or not a termination is crossed.
 
     Args:
@@ -45,9 +48,11 @@ def fly(
         starts: `clear` (z0 >= 0.1 m) or `paper` (exactly as printed).
         duration: of a trial in s, more than 0.5; the task's own where None.
         who: the pilot's name, for the record.
+        world: the simulator, one of `flytune`, `pybullet`, `mujoco`.
+        world_options: of that simulator, see `make_world`.
 
     Raises:
-        BadInput: an argument out of range.
+        BadInput: an argument out of range, or a simulator that is not installed.
         Diverged: the controller answered a finite observation with an action that is not finite.
     """
     duration = task.duration if duration is None else duration
@@ -60,15 +65,16 @@ def fly(
     if not 0 <= seed < 2**32:
         raise BadInput(f"seed: {seed} is not allowed. Allowed: a whole number, 0 to {2**32 - 1}.")
     steps = round(duration / CONTROL_PERIOD)
-    keys = jax.vmap(partial(jax.random.fold_in, jax.random.key(seed)))(jnp.arange(trials))
-    record = _fly_all(controller, task, EVALUATION_STARTS[starts], keys, steps)
-    states, actions, left, crashed, given, finite = jax.tree.map(np.asarray, record)
-    if not np.all(finite):
-        trial, step = np.argwhere(~finite)[0]
-        raise Diverged(
-            f"{who or 'controller'}: action {given[trial, step]} is not finite in trial {trial} "
-            f"at {step * CONTROL_PERIOD:.2f} s, on a finite observation."
-        )
+    drawn, keys = EVALUATION_STARTS[starts], trial_keys(seed, trials)
+    if world == "flytune" and not world_options:
+        record = _fly_at_once(controller, task, drawn, keys, steps, who)
+    else:
+        elsewhere = make_world(world, task.vehicle, trials, world_options)
+        try:
+            record = fly_in_world(elsewhere, controller, task, drawn, keys, steps, who)
+        finally:
+            elsewhere.close()
+    states, actions, left, crashed = jax.tree.map(np.asarray, record)
     return Flights(
         time=np.arange(steps + 1) * CONTROL_PERIOD,
         position=np.stack(states.position, axis=-1),
@@ -85,10 +91,21 @@ def fly(
         who=who,
         task=task.name,
         vehicle=task.vehicle.name,
-        world="flytune",
+        world=world,
         seed=seed,
         starts=starts,
     )
+
+
+def _fly_at_once(
+    controller: Any, task: Task, starts: InitialState, keys: jax.Array, steps: int, who: str
+) -> tuple[State, Any, dict[str, Any], Any]:
+    """The same as `fly_in_world`, in flytune's own world: one compiled program."""
+    *record, given, finite = _fly_all(controller, task, starts, keys, steps)
+    if not np.all(finite):
+        trial, step = np.argwhere(~np.asarray(finite))[0]
+        raise not_finite(who, given[trial, step], trial, step)
+    return tuple(record)
 
 
 @partial(jax.jit, static_argnames="steps")
@@ -98,32 +115,19 @@ def _fly_all(controller: Any, task: Task, starts: InitialState, keys: jax.Array,
 
 def _fly_one(controller: Any, task: Task, starts: InitialState, key: jax.Array, steps: int) -> Any:
     """States, actions, margins at samples 0 to `steps`; crashed or not; the actions as given, and which were finite."""
-    start_key, noise_key = jax.random.split(key)
-    start = starts.draw(task.vehicle, start_key)
+    start, noise_key = begin(task, starts, key)
     rest = jnp.zeros(4)
 
     def advance(carry: Any, index: jax.Array) -> Any:
         state, last_action, memory, crashed = carry
-        normal = draw_noise(jax.random.fold_in(noise_key, index))
-        seen = observe(task.target, task.noise, state, last_action, normal)
-        memory, action = controller.act(memory, seen)
-        finite = jnp.all(jnp.isfinite(action)) | ~jnp.all(jnp.isfinite(seen))
-        given, action = action, jnp.clip(action, -1.0, 1.0)
+        memory, action, given, finite = decide(controller, task, noise_key, index, state, last_action, memory)
         moved = dynamics.step(task.vehicle, state, action)
-        crashed = crashed | _is_lost(task, moved)
+        crashed = crashed | is_lost(task, moved)
         kept = jax.tree.map(lambda new, old: jnp.where(crashed, old, new), (moved, action), (state, last_action))
         return (*kept, memory, crashed), (*kept, given, finite)
 
-    carry = (start, rest, controller.initial_memory(), _is_lost(task, start))
+    carry = (start, rest, controller.initial_memory(), is_lost(task, start))
     (_, _, _, crashed), (states, actions, given, finite) = jax.lax.scan(advance, carry, jnp.arange(steps))
     states = jax.tree.map(lambda first, later: jnp.concatenate([first[None], later]), start, states)
     actions = jnp.concatenate([rest[None], actions])
-    changes = jnp.diff(actions, axis=0, prepend=rest[None])
-    left = jax.vmap(lambda s, change: margins(task.termination, situation(task.target, s, change)))(states, changes)
-    return states, actions, left, crashed, given, finite
-
-
-def _is_lost(task: Task, state: State) -> jax.Array:
-    distance = safe_norm(position_error(task.target, state.position))
-    body = jnp.stack([*state.position, *state.attitude, *state.velocity, *state.body_rate])
-    return ~((distance <= CRASH_DISTANCE) & jnp.all(jnp.isfinite(body)))
+    return states, actions, margins_along(task, states, actions), crashed, given, finite
