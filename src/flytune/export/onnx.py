@@ -1,0 +1,128 @@
+"""Policies as ONNX files: written here, read by `load_onnx`.
+
+One input `observation`, float32 [batch, 17], and one output `action`, float32 [batch, 4] in [-1, 1]; scaling and
+squashing are inside. The metadata says what the numbers mean, which task and which vehicle they are for.
+"""
+
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+from jaxtyping import Float
+
+from flytune.control.policy import Policy
+from flytune.errors import BadInput
+from flytune.export.onnx_pilot import OnnxPilot, load_onnx, read_onnx
+from flytune.export.onnx_session import CONVENTIONS, FORMAT, INPUT, OUTPUT, VERSION, sample_observations
+from flytune.extras import require
+from flytune.task.observation import SIZE
+
+__all__ = ["CONVENTIONS", "OnnxPilot", "load_onnx", "rounding_bound", "save_onnx"]
+
+# Of December 2020: read by onnxruntime 1.6 and everything since, and nothing in the graph has changed after it.
+OPERATOR_SET, INTERMEDIATE_REPRESENTATION = 13, 7
+CHECKED = 10_000  # observations on which the file must answer as the policy does
+UNIT_ROUNDOFF = 2.0**-24  # of float32
+TANH_ERROR = 8 * UNIT_ROUNDOFF  # measured: 5.5 in onnxruntime 1.32, 4.6 in XLA, over all of [-12, 12]
+
+
+def save_onnx(path: Path, policy: Policy) -> None:
+    """Write a policy as ONNX, once onnxruntime answers from the file as the policy does; same policy, same bytes.
+
+    Raises:
+        BadInput: the extra `onnx` is missing, the file cannot be written, or it answers otherwise; nothing is left.
+    """
+    content = _model(policy).SerializeToString()
+    whole = path.with_name(path.name + ".part")
+    try:
+        whole.write_bytes(content)
+        _check(read_onnx(whole.read_bytes(), str(path)), policy, path)
+        whole.replace(path)
+    except OSError as error:
+        raise BadInput(f"out: {path} cannot be written ({error.strerror}). Give another file.") from None
+    finally:
+        whole.unlink(missing_ok=True)
+
+
+def rounding_bound(policy: Policy, observations: Float[np.ndarray, "batch 17"]) -> Float[np.ndarray, "batch 4"]:
+    """How far float32 may take each action from the exact one, whatever the order of its sums.
+
+        |fl(x w + b) - (x w + b)| <= gamma (|x| |w| + |b|) + e |w|,   gamma = k u / (1 - k u), k = inputs + 1
+        |tanh(z + e) - tanh(z)| <= e / cosh(max(|z| - e, 0))^2
+
+    with u = 2^-24, e the error of what comes in, and `TANH_ERROR` for the tanh routine itself.
+
+    Source: Higham 2002, Accuracy and Stability of Numerical Algorithms, section 3.1; the mean value theorem.
+    """
+    x = observations.astype(float) * np.asarray(policy.input_scale, float)
+    error = UNIT_ROUNDOFF * np.abs(x)
+    last = len(policy.actor.weights) - 1
+    for index, (weight, bias) in enumerate(zip(policy.actor.weights, policy.actor.biases, strict=True)):
+        w, b = np.asarray(weight, float), np.asarray(bias, float)
+        roundings = (len(w) + 1) * UNIT_ROUNDOFF
+        gamma = roundings / (1 - roundings)
+        error = error @ np.abs(w) + gamma * ((np.abs(x) + error) @ np.abs(w) + np.abs(b))
+        x = x @ w + b
+        if index < last or policy.squash == "tanh":
+            nearest = np.minimum(np.maximum(np.abs(x) - error, 0), 300)  # beyond 300, cosh^2 overflows
+            error = error / np.cosh(nearest) ** 2 + TANH_ERROR
+            x = np.tanh(x)
+    return error
+
+
+def _check(pilot: OnnxPilot, policy: Policy, path: Path) -> None:
+    observations = sample_observations(CHECKED)
+    difference = np.abs(pilot.session(observations) - np.asarray(jax.jit(policy.__call__)(observations)))
+    allowed = 2 * rounding_bound(policy, observations)  # each of the two may be that far from the exact action
+    if not np.all(difference <= allowed):
+        row, motor = np.unravel_index(np.argmax(difference - allowed), difference.shape)
+        raise BadInput(
+            f"{path}: onnxruntime answers sample observation {row} otherwise than the policy, by "
+            f"{difference[row, motor]:.2g} at motor {motor}. Allowed: {allowed[row, motor]:.2g}, the rounding of "
+            "float32. Nothing was written; try another version of onnxruntime."
+        )
+
+
+def _model(policy: Policy) -> Any:
+    onnx = require("onnx", "onnx")
+    helper = onnx.helper
+    nodes, weights = [], []
+
+    def weight(name: str, values: Any) -> str:
+        weights.append(onnx.numpy_helper.from_array(np.asarray(values, np.float32), name))
+        return name
+
+    def node(operator: str, *inputs: str, output: str) -> str:
+        nodes.append(helper.make_node(operator, inputs, [output], name=output))
+        return output
+
+    value = node("Mul", INPUT, weight("input_scale", policy.input_scale), output="scaled")
+    last = len(policy.actor.weights) - 1
+    for index, (matrix, bias) in enumerate(zip(policy.actor.weights, policy.actor.biases, strict=True)):
+        layer = f"actor.{index}"
+        value = node("MatMul", value, weight(f"{layer}.weight", matrix), output=f"{layer}.product")
+        value = node("Add", value, weight(f"{layer}.bias", bias), output=f"{layer}.sum")
+        if index < last or policy.squash == "tanh":
+            value = node("Tanh", value, output=f"{layer}.tanh")
+    # after a tanh as well: that of onnxruntime oversteps 1 by two units in the last place
+    node("Clip", value, weight("least", -1.0), weight("most", 1.0), output=OUTPUT)
+    graph = helper.make_graph(
+        nodes,
+        "policy",
+        [helper.make_tensor_value_info(INPUT, onnx.TensorProto.FLOAT, ["batch", SIZE])],
+        [helper.make_tensor_value_info(OUTPUT, onnx.TensorProto.FLOAT, ["batch", 4])],
+        weights,
+    )
+    model = helper.make_model(
+        graph,
+        opset_imports=[helper.make_opsetid("", OPERATOR_SET)],
+        ir_version=INTERMEDIATE_REPRESENTATION,
+        producer_name="flytune",
+        producer_version=metadata.version("flytune"),
+    )
+    about = {key: str(value) for key, value in policy.about.items()}
+    facts = {FORMAT: "flytune-onnx-1", VERSION: metadata.version("flytune")}
+    helper.set_model_props(model, about | CONVENTIONS | facts)
+    return model
