@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from flytune import env
+from flytune.bridges.single import PARTS
 from flytune.env import Episode
 from flytune.task.observation import NOISY
 from flytune.task.task import Task
@@ -76,8 +77,8 @@ class Batch:
         """What actions [N, 4] brought; they are clipped to [-1, 1]."""
         self.episodes, self.key, *report = _step(self._numbers, self.episodes, self.key, action)
         # copies, because what JAX gives is read-only and may be memory it uses again
-        self.observation, final_observation, numbers = (np.array(part) for part in report)
-        reward, cause, truncated, episode_return, episode_length, *terms = numbers
+        self.observation, final_observation = np.array(report[0]), np.array(report[1])
+        reward, cause, truncated, episode_return, episode_length, *terms = np.array(report[2], float)
         return Transition(
             observation=self.observation,
             final_observation=final_observation,
@@ -89,6 +90,11 @@ class Batch:
             episode_return=episode_return,
             episode_length=episode_length.astype(np.int64),
         )
+
+    def bodies(self) -> np.ndarray:
+        """Where the vehicles are and how they move, [N, 17] as in `single.PARTS`."""
+        state = self.episodes.state
+        return np.stack([np.asarray(number) for name in PARTS for number in getattr(state, name)], axis=-1)
 
 
 @partial(jax.jit, static_argnames="number")
