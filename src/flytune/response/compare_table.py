@@ -20,16 +20,24 @@ NOTE = (
     "other does not. Intervals are for these pilots as they are; another training of the same kind would differ more.",
 )
 
-# metric -> (what a pilot does, with more, with less, with as much, unit, factor to that unit, decimals)
-WORDS = {
-    "position.settling_time": ("settles", "later", "earlier", "as early as", " s", 1.0, 2),
-    "yaw.settling_time": ("settles in yaw", "later", "earlier", "as early as", " s", 1.0, 2),
-    "position.overshoot": ("overshoots", "more", "less", "as much as", " % of the step", 100.0, 2),
-    "position.steady_state_error": ("stays", "farther off", "nearer", "as near as", " mm", 1e3, 2),
-    "yaw.steady_state_error": ("points", "farther off", "nearer", "as near as", " deg", math.degrees(1), 3),
-    "peak_speed": ("peaks", "faster", "slower", "as fast as", " m/s", 1.0, 2),
-    "action.rms": ("acts (RMS)", "harder", "more gently", "as hard as", "", 1.0, 4),
-    "action.total_variation": ("changes its action per step", "more", "less", "as much as", "", 1.0, 4),
+WAYS = {  # field of the judgement -> (how a pilot with more of it compares, how one with less)
+    "settling_time": ("later", "earlier"),
+    "overshoot": ("more", "less"),
+    "steady_state_error": ("farther off", "nearer"),
+    "rms_error": ("larger", "smaller"),
+    "peak_speed": ("faster", "slower"),
+    "action_rms": ("harder", "more gently"),
+    "action_total_variation": ("more", "less"),
+}
+WORDS = {  # metric -> (what a pilot does, with as much, unit, factor to that unit, decimals)
+    "position.settling_time": ("settles", "as early as", " s", 1.0, 2),
+    "yaw.settling_time": ("settles in yaw", "as early as", " s", 1.0, 2),
+    "position.overshoot": ("overshoots", "as much as", " % of the step", 100.0, 2),
+    "position.steady_state_error": ("stays", "as near as", " mm", 1e3, 2),
+    "yaw.steady_state_error": ("points", "as near as", " deg", math.degrees(1), 3),
+    "peak_speed": ("peaks", "as fast as", " m/s", 1.0, 2),
+    "action.rms": ("acts (RMS)", "as hard as", "", 1.0, 4),
+    "action.total_variation": ("changes its action per step", "as much as", "", 1.0, 4),
 }
 
 
@@ -85,7 +93,8 @@ def sentences(differences: Sequence[Difference], against: str) -> list[str]:
 
 
 def _clause(difference: Difference, against: str, whole: bool) -> str:
-    verb, more, less, equal, unit, scale, decimals = WORDS[difference.metric.name]
+    verb, equal, unit, scale, decimals = WORDS[difference.metric.name]
+    more, less = WAYS[difference.metric.field]
     who = f"{_short(difference.who)} " if whole else ""
     middle, low, high = difference.median, difference.low, difference.high
     if not difference.compared:

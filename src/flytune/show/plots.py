@@ -38,16 +38,16 @@ def response(flights: Flights, judgement: Judgement, task: Task) -> go.Figure:
         subplot_titles=[heading("whole flight"), heading(f"close-up: the target ± {BANDS_IN_CLOSE_UP} bands")],
     )
     shown = range(min(TRIALS_SHOWN, flights.trials))
-    step = _stride(flights)
+    step = stride(flights)
     for row, axis in enumerate(AXES, start=1):
-        values, target, band = _course(flights, axis)
+        values, target, band = course(flights, axis)
         for column in (1, 2):
             for trial in shown:
                 name = f"trial {trial + 1}" + (" (crashed)" if judgement.crashed[trial] else "")
                 curve = _curve(flights, values[trial], step, trial, name, legend=(row, column) == (1, 1))
                 figure.add_trace(curve, row=row, col=column)
                 figure.add_trace(_settled_dot(flights, values, judgement, axis, trial), row=row, col=column)
-            _target_and_band(figure, row, column, target, band)
+            target_and_band(figure, row, column, target, band)
         wide = BANDS_IN_CLOSE_UP * band
         figure.update_yaxes(title_text=f"{axis} [{UNITS[axis]}]", row=row, col=1)
         figure.update_yaxes(range=[target - wide, target + wide], row=row, col=2)
@@ -59,11 +59,12 @@ def response(flights: Flights, judgement: Judgement, task: Task) -> go.Figure:
     return style.frame(figure, 920, hovermode="x")
 
 
-def _stride(flights: Flights) -> int:
+def stride(flights: Flights) -> int:
+    """Every how many samples a curve has a point."""
     return max(1, flights.time.size // POINTS)
 
 
-def _course(flights: Flights, axis: str) -> tuple[Float[np.ndarray, "N K"], float, float]:
+def course(flights: Flights, axis: str) -> tuple[Float[np.ndarray, "N K"], float, float]:
     """Values [N, K], target and band of an axis in its unit; yaw without jumps, as the judge reads it."""
     if axis != "yaw":
         index = AXES.index(axis)
@@ -111,7 +112,8 @@ def _settled_dot(flights: Flights, values: np.ndarray, judgement: Judgement, axi
     )
 
 
-def _target_and_band(figure: go.Figure, row: int, column: int, target: float, band: float) -> None:
+def target_and_band(figure: go.Figure, row: int, column: int, target: float, band: float) -> None:
+    """Draw the target and the settling band behind the curves of a panel."""
     place: dict[str, Any] = {"row": row, "col": column}
     figure.add_hrect(target - band, target + band, fillcolor=style.BAND, line_width=0, layer="below", **place)
     figure.add_hline(target, line={"color": style.QUIET, "width": 1, "dash": "dash"}, layer="below", **place)
@@ -124,7 +126,7 @@ def _draw_altitude_bounds(figure: go.Figure, task: Task, row: int) -> None:
 
 
 def _draw_speed(figure: go.Figure, flights: Flights, judgement: Judgement, shown: range, row: int) -> None:
-    step = _stride(flights)
+    step = stride(flights)
     for trial in shown:
         speed = np.linalg.norm(flights.velocity[trial], axis=-1)
         name = f"trial {trial + 1}" + (" (crashed)" if judgement.crashed[trial] else "")
@@ -163,7 +165,7 @@ def spread(judgement: Judgement) -> go.Figure | str:
             finite = values[axis][np.isfinite(values[axis])] * scale
             drawn += finite.size
             ticks.append(f"{axis}<br>{finite.size}/{judgement.trials}")
-            figure.add_trace(_box(finite, place, axis), row=1, col=column)
+            figure.add_trace(box(finite, place, axis, style.AXES[axis]), row=1, col=column)
         figure.update_xaxes(tickvals=list(range(len(axes))), ticktext=ticks, range=[-0.6, len(axes) - 0.4], col=column)
         figure.update_yaxes(title_text=unit, rangemode="tozero", col=column)
     if not drawn:
@@ -172,18 +174,19 @@ def spread(judgement: Judgement) -> go.Figure | str:
     return style.frame(figure, 430, showlegend=False, margin={"l": 66, "r": 14, "t": 40, "b": 56})
 
 
-def _box(values: Float[np.ndarray, "M"], place: int, axis: str) -> go.Box:
+def box(values: Float[np.ndarray, "M"], place: int, name: str, colour: str) -> go.Box:
+    """A box with all its values as dots, standing at the place on the x axis."""
     return go.Box(
         x=np.full(values.size, place, dtype=np.int8),
         y=values.astype(np.float32),
-        name=axis,
+        name=name,
         width=0.55,
         boxpoints="all",
         jitter=0.6,
         pointpos=0,
-        line={"color": style.AXES[axis], "width": 1.3},
+        line={"color": colour, "width": 1.3},
         fillcolor="rgba(0, 0, 0, 0)",
-        marker={"color": style.AXES[axis], "size": 3.5, "opacity": 0.35},
+        marker={"color": colour, "size": 3.5, "opacity": 0.35},
         hoverinfo="y",
         yhoverformat=".3f",
     )
@@ -250,7 +253,7 @@ def _tightness(margin: Float[np.ndarray, "N K"]) -> float:
 def _draw_margin(
     figure: go.Figure, flights: Flights, margin: Float[np.ndarray, "N K"], row: int, column: int, legend: bool
 ) -> None:
-    step = 2 * _stride(flights)
+    step = 2 * stride(flights)
     levels = _percentiles(100.0 * margin[:, ::step], (0, 5, 50, 95, 100))
     common: dict[str, Any] = {"x0": 0, "dx": step * float(flights.time[1]), "mode": "lines", "showlegend": False}
     edge = {"width": 0, "color": style.AXES["x"]}
@@ -285,7 +288,7 @@ def _percentiles(values: Float[np.ndarray, "N K"], levels: tuple[int, ...]) -> l
 def flights_3d(flights: Flights) -> go.Figure:
     """The trajectories in space: the first trials in colour with their starts, the others in grey, the target."""
     figure = go.Figure()
-    step = 2 * _stride(flights)
+    step = 2 * stride(flights)
     shown = min(TRIALS_SHOWN, flights.trials)
     behind = flights.position[shown : shown + TRIALS_BEHIND, :: 2 * step]
     if len(behind):

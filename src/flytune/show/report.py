@@ -4,7 +4,7 @@ import contextlib
 import dataclasses
 import math
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from html import escape
 from pathlib import Path
 from typing import Any
@@ -53,11 +53,20 @@ def write_report(path: Path, entries: Sequence[Entry]) -> None:
     """
     if not entries:
         raise BadInput("report: no policy. Allowed: one or more. Name a run directory, a policy file or a controller.")
+    write_whole(path, lambda: _page(entries))
+
+
+def write_whole(path: Path, make: Callable[[], str]) -> None:
+    """Write the page that `make` returns, whole or not at all; it is made only where it can be written.
+
+    Raises:
+        BadInput: the file cannot be written.
+    """
     if not os.path.isdir(path.parent):  # unlike Path.is_dir, also where the name itself is too long
         raise BadInput(f"out: {path.parent} is no folder. Allowed: a file in a folder that exists. Make it first.")
     if os.path.isdir(path):
         raise BadInput(f"out: {path} is a folder. Allowed: a file, for instance {path / 'report.html'}.")
-    text = _page(entries)
+    text = make()
     whole = path.with_name(path.name + ".part")
     try:
         whole.write_text(text, encoding="utf-8", errors="replace")  # a file name need not be valid Unicode

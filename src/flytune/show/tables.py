@@ -62,7 +62,7 @@ def response_table(judgement: Judgement) -> str:
                 unit,
             )
         )
-    return _table(head, rows)
+    return table(head, rows)
 
 
 def facts(judgement: Judgement, speed_bound: float | None) -> str:
@@ -116,7 +116,7 @@ def comparison_table(judged: Sequence[tuple[str, str, Judgement]]) -> str:
                 str(told["crashed"]),
             )
         )
-    return _table(head, rows, "dense")
+    return table(head, rows, "dense")
 
 
 def differences_table(tasks: Sequence[tuple[str, Task]]) -> str:
@@ -130,7 +130,7 @@ def differences_table(tasks: Sequence[tuple[str, Task]]) -> str:
     rows = [
         (f"<code>{escape(path)}</code>", *(escape(leaves.get(path, DASH)) for leaves in flat)) for path in differing
     ]
-    return _table(head, rows)
+    return table(head, rows)
 
 
 def _leaves(node: Mapping, path: str = "") -> list[tuple[str, str]]:
@@ -164,7 +164,7 @@ def number(value: float | None, decimals: int, scale: float = 1.0) -> str:
     return DASH if value is None else f"{value * scale:.{decimals}f}"
 
 
-def _table(head: str, rows: Sequence[Row], kind: str = "plain") -> str:
+def table(head: str, rows: Sequence[Row], kind: str = "plain") -> str:
     """A table whose first column heads its rows; cells are HTML."""
     body = "".join(
         f'<tr><th scope="row">{row[0]}</th>' + "".join(f"<td>{cell}</td>" for cell in row[1:]) + "</tr>" for row in rows

@@ -1,0 +1,269 @@
+"""Figures of several pilots over the same trials; a pilot has one colour and one number in all of them."""
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import plotly.graph_objects as go
+from jaxtyping import Float
+from plotly.subplots import make_subplots
+
+from flytune.response import metrics
+from flytune.response.compare import Comparison
+from flytune.response.compare_table import WAYS
+from flytune.response.difference import METRICS, Difference, Metric
+from flytune.response.flights import Flights
+from flytune.response.judge import CHANNELS
+from flytune.show import plots, style
+from flytune.show.style import heading, label
+
+TRIALS_SHOWN = 3  # of each pilot, the first ones; more lines than these hide each other
+FLOOR = 0.01  # of the band; an error below it is drawn there, as a logarithmic axis has no zero
+BOXES = (
+    "position.settling_time",
+    "yaw.settling_time",
+    "position.overshoot",
+    "yaw.overshoot",
+    "position.steady_state_error",
+    "yaw.steady_state_error",
+    "peak_speed",
+    "action.total_variation",
+)
+NAMES = {
+    "settling_time": "settling time",
+    "overshoot": "overshoot",
+    "steady_state_error": "steady-state error",
+    "rms_error": "RMS error",
+    "peak_speed": "peak speed",
+    "action_rms": "action, RMS",
+    "action_total_variation": "action, change",
+}
+SCALES = {"s": ("s", 1.0), "m": ("mm", 1e3), "rad": ("deg", math.degrees(1)), "m/s": ("m/s", 1.0), "1": ("1", 1.0)}
+
+
+def title(metric: Metric) -> str:
+    """A metric in words."""
+    return " ".join(filter(None, [metric.channel, NAMES[metric.field]]))
+
+
+def unit(metric: Metric) -> tuple[str, float]:
+    """The unit a metric is shown in, and its factor."""
+    return ("%", 100.0) if metric.field == "overshoot" else SCALES[metric.unit]
+
+
+def numbered(names: Sequence[str], longest: int = 40) -> list[str]:
+    """The pilots' names behind their numbers, as texts of a figure."""
+    return [f"<b>{number}</b> {label(name, longest)}" for number, name in enumerate(names, start=1)]
+
+
+def responses(flights: Sequence[Flights], comparison: Comparison) -> go.Figure:
+    """x, y, z, yaw and distance: the same few trials of every pilot, and the error of all trials as it dies out."""
+    figure = make_subplots(
+        len(CHANNELS),
+        2,
+        shared_xaxes="all",  # pyright: ignore[reportArgumentType]  (its stub knows booleans only)
+        vertical_spacing=0.03,
+        horizontal_spacing=0.1,
+        subplot_titles=[heading("the same few trials"), heading("error over all trials: median and middle half")],
+    )
+    shown = min(TRIALS_SHOWN, flights[0].trials)
+    for row, channel in enumerate(CHANNELS, start=1):
+        for index, flown in enumerate(flights):
+            _draw_trials(figure, flown, channel, shown, index, row)
+            _draw_error(figure, flown, comparison.judgements[index].crashed, channel, index, row)
+        _, target, band = _course(flights[0], channel)
+        plots.target_and_band(figure, row, 1, target, band)
+        place: dict[str, Any] = {"row": row, "col": 2}
+        figure.add_hrect(FLOOR * band, band, fillcolor=style.BAND, line_width=0, layer="below", **place)
+        unit = "deg" if channel == "yaw" else "m"
+        sign = "distance" if channel == "position" else channel
+        figure.update_yaxes(title_text=f"{sign} [{unit}]", row=row, col=1)
+        figure.update_yaxes(title_text=f"|{channel} error| [{unit}]", type="log", dtick=1, row=row, col=2)
+    figure.update_xaxes(range=[0, flights[0].duration], hoverformat=".2f")
+    figure.update_xaxes(title_text="time [s]", row=len(CHANNELS))
+    return _name(style.frame(figure, 1120, hovermode="x", margin=_margin(comparison.names)), comparison.names)
+
+
+def _course(flights: Flights, channel: str) -> tuple[Float[np.ndarray, "N K"], float, float]:
+    """Values, target and band of an axis, or the distance from the target, which is to be 0."""
+    if channel != "position":
+        return plots.course(flights, channel)
+    return np.linalg.norm(flights.position - flights.target_position, axis=-1), 0.0, metrics.POSITION_BAND
+
+
+def _error(flights: Flights, channel: str) -> Float[np.ndarray, "N K"]:
+    """Absolute error of a channel in the unit of its course; of yaw the shorter way round, as the band sees it."""
+    values, target, _ = _course(flights, channel)
+    error = np.asarray(values, dtype=np.float64) - target
+    return np.abs(np.degrees(metrics.wrap_angle(np.radians(error))) if channel == "yaw" else error)
+
+
+def _draw_trials(figure: go.Figure, flights: Flights, channel: str, shown: int, index: int, row: int) -> None:
+    """The first trials of one pilot as one trace, so that its name hides and shows them together."""
+    step = plots.stride(flights)
+    values = _course(flights, channel)[0][:shown, ::step]
+    gap = np.full((shown, 1), np.nan)
+    time = np.broadcast_to(flights.time[::step], values.shape)
+    trace = go.Scatter(
+        x=np.concatenate([time, gap], axis=1).ravel().astype(np.float32),
+        y=np.concatenate([values, gap], axis=1).ravel().astype(np.float32),
+        mode="lines",
+        line={"color": style.colour(index), "width": 1.3, "simplify": False},
+        legendgroup=str(index),
+        showlegend=False,
+        hovertemplate="%{y:.3f}",
+        meta=index,
+    )
+    figure.add_trace(trace, row=row, col=1)
+
+
+def _draw_error(figure: go.Figure, flights: Flights, crashed: np.ndarray, channel: str, index: int, row: int) -> None:
+    """Median and middle half of the error over all trials; a crashed trial is infinitely far at every instant."""
+    step = plots.stride(flights)
+    error = np.where(crashed[:, None], np.inf, _error(flights, channel)[:, ::step])
+    floor = FLOOR * _course(flights, channel)[2]
+    low, middle, high = (_quantile(error, share, floor) for share in (0.25, 0.5, 0.75))
+    colour = style.colour(index)
+    common: dict[str, Any] = {
+        "x0": 0,
+        "dx": step * float(flights.time[1]),
+        "mode": "lines",
+        "legendgroup": str(index),
+        "showlegend": False,
+        "meta": index,
+    }
+    edge = {"width": 0, "color": colour}
+    figure.add_trace(go.Scatter(**common, y=low, line=edge, hoverinfo="skip"), row=row, col=2)
+    shade = f"rgba({', '.join(str(int(colour[at : at + 2], 16)) for at in (1, 3, 5))}, 0.15)"
+    band = go.Scatter(**common, y=high, line=edge, fill="tonexty", fillcolor=shade, hoverinfo="skip")
+    figure.add_trace(band, row=row, col=2)
+    line = {"color": colour, "width": 1.8, "simplify": False}
+    median = go.Scatter(**{**common, "showlegend": row == 1}, y=middle, line=line, hovertemplate="%{y:.4f}")
+    figure.add_trace(median, row=row, col=2)
+
+
+def _quantile(error: Float[np.ndarray, "N K"], share: float, floor: float) -> Float[np.ndarray, "K"]:
+    """The error that this share of the trials does not exceed, at every instant; NaN, a gap, where it is infinite."""
+    ranked = np.sort(np.where(np.isnan(error), np.inf, error), axis=0)
+    chosen = np.maximum(ranked[max(math.ceil(share * len(ranked) - 1e-9) - 1, 0)], floor)
+    return np.where(np.isfinite(chosen), chosen, np.nan).astype(np.float32)
+
+
+def boxes(comparison: Comparison) -> go.Figure | str:
+    """Box plots of each metric, the pilots side by side, with the number of trials that each box holds."""
+    chosen = [metric for metric in METRICS if metric.name in BOXES]
+    figure = make_subplots(
+        2, 4, vertical_spacing=0.2, horizontal_spacing=0.07, subplot_titles=[heading(title(one)) for one in chosen]
+    )
+    drawn = 0
+    for panel, metric in enumerate(chosen):
+        row, column = divmod(panel, 4)
+        symbol, scale = unit(metric)
+        ticks = []
+        for index, judgement in enumerate(comparison.judgements):
+            values = metric.values(judgement)
+            finite = values[np.isfinite(values)] * scale
+            drawn += finite.size
+            ticks.append(f"<b>{index + 1}</b><br>{finite.size}")
+            trace = plots.box(finite, index, "", style.colour(index))
+            trace.update(legendgroup=str(index), showlegend=panel == 0, meta=index)
+            figure.add_trace(trace, row=row + 1, col=column + 1)
+        place: dict[str, Any] = {"row": row + 1, "col": column + 1}
+        count = len(comparison.judgements)
+        figure.update_xaxes(tickvals=list(range(count)), ticktext=ticks, range=[-0.6, count - 0.4], **place)
+        figure.update_yaxes(title_text=f"[{symbol}]", rangemode="tozero", **place)
+    if not drawn:
+        return "Every trial of every pilot crashed, so there is nothing to draw."
+    figure.update_xaxes(showgrid=False, tickangle=0, tickfont_size=11)
+    return _name(style.frame(figure, 700, margin=_margin(comparison.names)), comparison.names)
+
+
+def paired(comparison: Comparison) -> go.Figure:
+    """Median difference of each pilot from the reference, metric by metric, with its interval; zero is as good."""
+    columns = 4
+    rows = math.ceil(len(METRICS) / columns)
+    others = [index for index in range(len(comparison.names)) if index != comparison.reference]
+    panel_height = 62 + 24 * len(others)
+    margin = _margin(comparison.names)
+    height = margin["t"] + margin["b"] + rows * (panel_height + 44)
+    figure = make_subplots(
+        rows,
+        columns,
+        vertical_spacing=84 / (height - margin["t"] - margin["b"]),
+        horizontal_spacing=0.05,
+        subplot_titles=[f"{heading(title(metric))} [{unit(metric)[0]}]" for metric in METRICS],
+    )
+    for panel, metric in enumerate(METRICS):
+        row, column = (number + 1 for number in divmod(panel, columns))
+        found = [one for one in comparison.differences if one.metric is metric]
+        _draw_differences(figure, found, others, row, column)
+        more, less = WAYS[metric.field]
+        figure.update_xaxes(title_text=f"← {less} · {more} →", row=row, col=column)
+    ticks = {"tickvals": list(range(len(others))), "ticktext": [f"<b>{index + 1}</b>" for index in others]}
+    figure.update_yaxes(**ticks, range=[len(others) - 0.4, -0.6])
+    figure = style.frame(figure, round(height), margin=margin)
+    figure.update_yaxes(showgrid=False)
+    figure.update_xaxes(nticks=5, title_font_size=11.5, title_font_color=style.QUIET, tickfont_size=11)
+    return _name(figure, comparison.names)
+
+
+def _draw_differences(
+    figure: go.Figure, differences: Sequence[Difference], pilots: Sequence[int], row: int, column: int
+) -> None:
+    """One panel: a dot and its interval per pilot; what is infinite stands as a triangle at the edge."""
+    _, scale = unit(differences[0].metric)
+    ends = np.array([[one.low, one.median, one.high] for one in differences]) * scale
+    known = np.append(ends[np.isfinite(ends)], 0.0)
+    spread = float(np.ptp(known)) or 1.0
+    left, right = float(known.min()) - 0.18 * spread, float(known.max()) + 0.18 * spread
+    place: dict[str, Any] = {"row": row, "col": column}
+    figure.add_vline(0, line={"color": style.QUIET, "width": 1, "dash": "dash"}, layer="below", **place)
+    for height, (pilot, difference, three) in enumerate(zip(pilots, differences, ends, strict=True)):
+        low, middle, high = np.clip(three, left, right)
+        colour = style.colour(pilot)
+        symbol = "circle" if np.isfinite(three[1]) else f"triangle-{'right' if three[1] > 0 else 'left'}"
+        common: dict[str, Any] = {"legendgroup": str(pilot), "showlegend": False, "meta": pilot}
+        figure.add_trace(
+            go.Scatter(
+                x=[low, high],
+                y=[height, height],
+                mode="lines",
+                line={"color": colour, "width": 3},
+                hoverinfo="skip",
+                **common,
+            ),
+            **place,
+        )
+        figure.add_trace(
+            go.Scatter(
+                x=[middle],
+                y=[height],
+                mode="markers",
+                marker={"color": colour, "size": 10, "symbol": symbol, "line": {"color": "white", "width": 1}},
+                hovertemplate=_told(difference, three),
+                **{**common, "showlegend": (row, column) == (1, 1)},
+            ),
+            **place,
+        )
+    figure.update_xaxes(range=[left, right], **place)
+
+
+def _told(difference: Difference, ends: Float[np.ndarray, "3"]) -> str:
+    """What a dot says when it is pointed at."""
+    low, middle, high = (f"{end:.4g}" for end in ends)
+    return (
+        f"{middle} ({low} to {high})<br>smaller in {difference.better}, larger in {difference.worse}, "
+        f"equal in {difference.tied}, left out {difference.left_out}"
+    )
+
+
+def _margin(names: Sequence[str]) -> dict[str, int]:
+    """Margins with room above for a legend: names take a line for every two or three."""
+    return {"l": 66, "r": 14, "t": 74 + 20 * ((len(names) - 1) // 2), "b": 48}
+
+
+def _name(figure: go.Figure, names: Sequence[str]) -> go.Figure:
+    """The figure with each trace named after the pilot it belongs to."""
+    texts = numbered(names)
+    return figure.for_each_trace(lambda trace: trace.update(name=texts[trace.meta], meta=None))
