@@ -1,6 +1,5 @@
 """From thrust and torque back to actions: the inverse of the mixer, of the rotor speed range and of the motors' lag."""
 
-from functools import reduce
 from typing import Any
 
 import jax.numpy as jnp
@@ -50,29 +49,29 @@ def allocate(vehicle: Vehicle, thrust: Any, torque: Components) -> Components:
     the inverse of paper R4. Where a rotor would leave the range of the actions, yaw torque gives way first, then
     thrust, and roll and pitch torque last, in their ratio: tilt decides whether the vehicle stays up, heading does not.
 
+    With r, p, y the three torque terms and m the thrust term, rotors 0 and 2 turn at m - y -+ (r + p), rotors 1 and 3
+    at m + y -+ (r - p). So the means of the two pairs, m - y and m + y, each have an interval, once r and p are known.
+
     Source: the equations, inverted by hand; the order of priorities is the usual one of flight stacks
     (PX4 user guide, "airmode").
     """
     lowest, highest = (commanded_rotor_speed(vehicle, jnp.asarray(action)) ** 2 for action in (-1.0, 1.0))
     bending = 4 * vehicle.thrust_coefficient * vehicle.lever
-    roll, pitch, yaw = torque[0] / bending, torque[1] / bending, torque[2] / (4 * vehicle.torque_coefficient)
+    roll, pitch = torque[0] / bending, torque[1] / bending
+    reach, room = jnp.abs(roll) + jnp.abs(pitch), (highest - lowest) / 2
+    share = jnp.where(reach > room, room / jnp.where(reach > room, reach, 1.0), 1.0)
+    first, second = share * (roll + pitch), share * (roll - pitch)
 
-    reach = jnp.abs(roll) + jnp.abs(pitch)  # some motor gets this much more, another this much less
-    share = _share(reach, (highest - lowest) / 2)
-    middle = jnp.clip(thrust / (4 * vehicle.thrust_coefficient), lowest + share * reach, highest - share * reach)
-    level = [middle + share * (r * roll + p * pitch) for r, p in zip(ROLL, PITCH, strict=True)]
-
-    rooms = [
-        jnp.where(sign * yaw > 0, highest - square, square - lowest) for sign, square in zip(YAW, level, strict=True)
-    ]
-    yaw = yaw * _share(jnp.abs(yaw), reduce(jnp.minimum, rooms))
-    return tuple(jnp.sqrt(square + sign * yaw) for sign, square in zip(YAW, level, strict=True))
-
-
-def _share(wanted: Any, room: Any) -> Any:
-    """The part of `wanted` that fits into `room`, both 0 or more."""
-    tight = wanted > room
-    return jnp.where(tight, jnp.maximum(room, 0.0) / jnp.where(tight, wanted, 1.0), 1.0)
+    low_a, high_a = lowest + jnp.abs(first), highest - jnp.abs(first)
+    low_b, high_b = lowest + jnp.abs(second), highest - jnp.abs(second)
+    middle = jnp.clip(thrust / (4 * vehicle.thrust_coefficient), (low_a + low_b) / 2, (high_a + high_b) / 2)
+    yaw = jnp.clip(
+        torque[2] / (4 * vehicle.torque_coefficient),
+        jnp.maximum(low_b - middle, middle - high_a),
+        jnp.minimum(high_b - middle, middle - low_a),
+    )
+    a, b = middle - yaw, middle + yaw
+    return tuple(jnp.sqrt(square) for square in (a - first, b - second, a + first, b + second))
 
 
 def action_for(

@@ -160,26 +160,28 @@ def linearised(vehicle: Vehicle) -> tuple[np.ndarray, np.ndarray]:
 
     The motors' lag and the drag are in it. An action latency is not.
     """
-
-    def after(x: jax.Array, u: jax.Array) -> jax.Array:
-        state = dynamics.hovering(vehicle, (0.0, 0.0, 0.0))
-        parts = unpack(x)
-        state = dynamics.State(
-            position=parts[:3],
-            velocity=parts[3:6],
-            attitude=rotation.exponential(parts[6:9]),
-            body_rate=parts[9:12],
-            rotor_speed_rpm=tuple(hover * (1 + vehicle.action_scale * r) for r in parts[12:]),
-            pending_actions=jnp.zeros((0, 4)),
-        )
-        end = dynamics.step(vehicle, state, u)
-        speeds = tuple((speed / hover - 1) / vehicle.action_scale for speed in end.rotor_speed_rpm)
-        angles = tuple(2 * part for part in end.attitude[:3])
-        return pack((*end.position, *end.velocity, *angles, *end.body_rate, *speeds))
-
-    hover = vehicle.hover_rotor_speed_rpm
-    a, b = jax.jit(jax.jacrev(after, argnums=(0, 1)))(jnp.zeros(STATES), jnp.zeros(4))
+    a, b = _jacobians(vehicle, jnp.zeros(STATES), jnp.zeros(4))
     return np.asarray(a, np.float64), np.asarray(b, np.float64)
+
+
+def _after(vehicle: Vehicle, x: Float[Array, "16"], u: Float[Array, "4"]) -> Float[Array, "16"]:
+    """The deviation from hover one control period later."""
+    parts, hover = unpack(x), vehicle.hover_rotor_speed_rpm
+    state = dynamics.State(
+        position=parts[:3],
+        velocity=parts[3:6],
+        attitude=rotation.exponential(parts[6:9]),
+        body_rate=parts[9:12],
+        rotor_speed_rpm=tuple(hover * (1 + vehicle.action_scale * r) for r in parts[12:]),
+        pending_actions=jnp.zeros((0, 4)),
+    )
+    end = dynamics.step(vehicle, state, u)
+    speeds = tuple((speed / hover - 1) / vehicle.action_scale for speed in end.rotor_speed_rpm)
+    angles = tuple(2 * part for part in end.attitude[:3])
+    return pack((*end.position, *end.velocity, *angles, *end.body_rate, *speeds))
+
+
+_jacobians = jax.jit(jax.jacrev(_after, argnums=(1, 2)))
 
 
 def _turned(vector: Components, yaw: Any) -> Components:

@@ -1,0 +1,141 @@
+"""Actuation: mixing, allocating and hurrying the motors give back what was asked for (paper R4, R9)."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from flytune.control.actuation import action_for, allocate, estimated_rotor_speed, hovering_rotors, mixed
+from flytune.physics.dynamics import CONTROL_PERIOD, commanded_rotor_speed, rotor_speed_after, thrust_and_torque
+from flytune.physics.vehicle import load_vehicle, vehicle_names
+
+VEHICLES = {name: load_vehicle(name) for name in vehicle_names()}
+actions = st.lists(st.floats(-1, 1, width=32), min_size=4, max_size=4)
+
+
+@jax.jit
+def there_and_back(vehicle, action):
+    """Rotor speeds of four actions, and those that thrust and torque of these are allocated to."""
+    speeds = tuple(commanded_rotor_speed(vehicle, part) for part in action)
+    return speeds, allocate(vehicle, *thrust_and_torque(vehicle, speeds))
+
+
+@jax.jit
+def delivered(vehicle, thrust, torque):
+    """Rotor speeds, and the thrust and torque that they give."""
+    speeds = allocate(vehicle, thrust, torque)
+    return speeds, *thrust_and_torque(vehicle, speeds)
+
+
+@pytest.mark.parametrize("name", VEHICLES)
+@settings(max_examples=50, deadline=None)
+@given(action=actions)
+def test_allocating_what_rotors_give_gives_back_the_rotors(name, action):
+    speeds, back = there_and_back(VEHICLES[name], tuple(map(jnp.float32, action)))
+    # squares of 2.6e8 rpm^2 are sums of four terms of that size in float32 (6e-8 each): 1e-6 of a speed
+    np.testing.assert_allclose(np.stack(back), np.stack(speeds), rtol=2e-6)
+
+
+@pytest.mark.parametrize("name", VEHICLES)
+def test_a_torque_within_reach_is_given_exactly_beside_the_weight(name):
+    vehicle = VEHICLES[name]
+    weight = vehicle.mass * vehicle.gravity
+    torque = (2e-2 * weight * vehicle.lever, -3e-2 * weight * vehicle.lever, 1e-5)
+    _, thrust, given_torque = delivered(vehicle, weight, torque)
+    # float32: differences of squares that are each a quarter of the weight, 2e-7 of it
+    np.testing.assert_allclose(thrust, weight, rtol=1e-6)
+    np.testing.assert_allclose(given_torque[:2], torque[:2], atol=1e-6 * weight * vehicle.lever)
+    turning = vehicle.torque_coefficient / vehicle.thrust_coefficient * weight
+    np.testing.assert_allclose(given_torque[2], torque[2], atol=1e-6 * turning)
+
+
+@pytest.mark.parametrize("name", VEHICLES)
+def test_a_saturated_yaw_torque_gives_way_and_leaves_thrust_roll_and_pitch_alone(name):
+    vehicle = VEHICLES[name]
+    weight = vehicle.mass * vehicle.gravity
+    torque = (0.1 * weight * vehicle.lever, 0.05 * weight * vehicle.lever, 1.0)
+    _, thrust, given_torque = delivered(vehicle, weight, torque)
+    np.testing.assert_allclose(thrust, weight, rtol=1e-6)
+    np.testing.assert_allclose(given_torque[:2], torque[:2], rtol=1e-4)
+    assert 0 < given_torque[2] < 1.0
+
+
+@pytest.mark.parametrize("name", VEHICLES)
+def test_thrust_gives_way_to_roll_and_pitch(name):
+    vehicle = VEHICLES[name]
+    weight = vehicle.mass * vehicle.gravity
+    largest = weight * vehicle.thrust_to_weight
+    torque = (0.1 * weight * vehicle.lever, 0.1 * weight * vehicle.lever, 0.0)
+    _, thrust, given_torque = delivered(vehicle, 10 * weight, torque)
+    np.testing.assert_allclose(given_torque[:2], torque[:2], rtol=1e-4)
+    # of rotors 0 and 2, one is at its limit and the other (tau_x + tau_y) / (2 l) = 0.1 weights below it; 1 and 3 are both
+    # at the limit, where roll and pitch cancel
+    np.testing.assert_allclose(thrust, largest - 0.1 * weight, rtol=1e-4)
+
+
+@pytest.mark.parametrize("name", VEHICLES)
+@settings(max_examples=50, deadline=None)
+@given(numbers=st.lists(st.floats(-50, 50, width=32), min_size=4, max_size=4))
+def test_whatever_is_asked_for_the_rotors_stay_in_the_range_of_the_actions(name, numbers):
+    vehicle = VEHICLES[name]
+    speeds, _, _ = delivered(vehicle, jnp.float32(numbers[0]), tuple(map(jnp.float32, numbers[1:])))
+    lowest, highest = (float(commanded_rotor_speed(vehicle, jnp.float32(a))) for a in (-1, 1))
+    # float32 beside squares of 6e8
+    assert np.all(np.stack(speeds) >= lowest * (1 - 1e-5)) and np.all(np.stack(speeds) <= highest * (1 + 1e-5))
+
+
+def test_too_much_roll_and_pitch_keeps_its_direction():
+    vehicle = VEHICLES["crazyflie"]
+    _, _, torque = delivered(vehicle, vehicle.mass * vehicle.gravity, (1.0, -0.5, 0.0))
+    np.testing.assert_allclose(torque[1] / torque[0], -0.5, rtol=1e-5)
+
+
+def test_mixing_squares_is_the_mixer_of_the_physics():
+    vehicle = VEHICLES["crazyflie"]
+    speeds = tuple(map(jnp.float32, (15000.0, 16000.0, 16500.0, 14000.0)))
+    thrust, torque = mixed(vehicle, tuple(s * s for s in speeds))
+    wanted_thrust, wanted_torque = thrust_and_torque(vehicle, speeds)
+    np.testing.assert_allclose(thrust, wanted_thrust, rtol=1e-6)
+    np.testing.assert_allclose(torque, wanted_torque, rtol=1e-5)
+
+
+# --- motors ---
+
+
+@pytest.mark.parametrize("name", VEHICLES)
+def test_rotors_at_hover_speed_need_no_action(name):
+    vehicle = VEHICLES[name]
+    now = hovering_rotors(vehicle)
+    np.testing.assert_allclose(action_for(vehicle, now, now, 0.02), 0, atol=1e-6)
+
+
+@pytest.mark.parametrize("direction", [1, -1])
+def test_a_lagging_motor_is_hurried_to_the_time_constant_asked_for(direction):
+    # after one period a first-order motor of 0.02 s has closed 1 - exp(-0.01/0.02) = 39.35 % of a gap of 40 rpm
+    vehicle = VEHICLES["crazyflie-measured"]
+    now = hovering_rotors(vehicle)
+    wanted = tuple(speed + direction * 40.0 for speed in now)
+    action = action_for(vehicle, now, wanted, 0.02)
+    commanded = tuple(commanded_rotor_speed(vehicle, part) for part in action)
+    after = rotor_speed_after(vehicle, now, commanded, CONTROL_PERIOD)
+    # float32 at 19,000 rpm is exact to 0.002 rpm; the action adds as much
+    np.testing.assert_allclose(np.stack(after) - np.stack(now), direction * 15.739, atol=0.02)
+
+
+def test_a_motor_that_answers_at_once_is_not_hurried():
+    vehicle = VEHICLES["crazyflie"]
+    now = hovering_rotors(vehicle)
+    wanted = tuple(speed + 800.0 for speed in now)
+    np.testing.assert_array_equal(action_for(vehicle, now, wanted, 0.02), action_for(vehicle, now, wanted))
+
+
+def test_the_rotors_a_pilot_believes_in_are_those_that_turn():
+    vehicle = VEHICLES["crazyflie-measured"]
+    believed = turning = hovering_rotors(vehicle)
+    for action in np.random.default_rng(0).uniform(-1, 1, (20, 4)).astype(np.float32):
+        commanded = tuple(commanded_rotor_speed(vehicle, part) for part in action)
+        turning = rotor_speed_after(vehicle, turning, commanded, CONTROL_PERIOD)
+        believed = estimated_rotor_speed(vehicle, believed, tuple(map(jnp.float32, action)))
+    np.testing.assert_array_equal(np.stack(believed), np.stack(turning))
