@@ -4,6 +4,7 @@ A model may come from anywhere. It may name other files for its weights, loop fo
 of that belongs into a policy, so only arithmetic that is known to be harmless is let through.
 """
 
+import math
 from collections.abc import Iterator
 from typing import Any
 
@@ -25,6 +26,7 @@ OPERATORS = {
     "ThresholdedRelu", "Transpose", "Unsqueeze", "Where",
 }
 # fmt: on
+WIDEST = 1_000_000  # numbers that one node may make of one observation; the paper's network makes 64
 NUMBERS = ("FLOAT", "FLOAT16", "DOUBLE", "INT32", "INT64", "BOOL")
 
 
@@ -39,14 +41,18 @@ def inspect(content: bytes, where: str) -> Any:
         model = onnx.load_model_from_string(content)
     except Exception as error:  # of several kinds, one for each way in which protobuf gives up
         raise BadInput(f"{where}: is not an ONNX model ({first_line(error)}). Give the file of a policy.") from None
+    if not model.graph.node:
+        raise BadInput(f"{where}: is not an ONNX model (there is no graph in it). Give the file of a policy.")
     model.DiscardUnknownFields()  # what has not been looked at is not run either
     _refuse_other_files(onnx, model, where)
     _refuse_more_than_arithmetic(onnx, model, where)
+    _refuse_other_ends(onnx, model.graph, where)
     try:
         onnx.checker.check_model(model, full_check=True)
+        inferred = onnx.shape_inference.infer_shapes(model, data_prop=True)
     except Exception as error:  # ValidationError, InferenceError, and RuntimeError from below
         raise BadInput(f"{where}: is a damaged ONNX model ({first_line(error)}). Export it again.") from None
-    _refuse_other_ends(onnx, model.graph, where)
+    _refuse_wide_nodes(inferred, where)
     _refuse_other_conventions(model, where)
     _refuse_broken_numbers(onnx, model, where)
     return model
@@ -122,8 +128,17 @@ def _refuse_other_ends(onnx: Any, graph: Any, where: str) -> None:
             )
 
 
+def _refuse_wide_nodes(inferred: Any, where: str) -> None:
+    for value in inferred.graph.value_info:
+        width = math.prod(size.dim_value or 1 for size in value.type.tensor_type.shape.dim)
+        if width > WIDEST:
+            raise BadInput(f"{where}: node {_shown(value.name)} makes {width} numbers. Allowed: up to {WIDEST}.")
+
+
 def _refuse_other_conventions(model: Any, where: str) -> None:
     found = metadata(model)
+    if not all(isinstance(text, str) for text in (*found, *found.values())):
+        raise BadInput(f"{where}: has damaged metadata (bytes that are not UTF-8). Export it again.")
     for key, wanted in CONVENTIONS.items():
         if found.get(key) != wanted:
             has = f"is {_shown(found[key])}" if key in found else "is missing"
