@@ -1,0 +1,61 @@
+"""TensorBoard: the rows of metrics.jsonl as event files beside it, written while a training runs."""
+
+import math
+import time
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+from flytune.extras import require
+
+
+class EventLog:
+    """An event file in a run directory; one scalar per number of a row, over environment steps.
+
+    A resumed run starts another file, which tells TensorBoard to forget the files before it and says the rows of the
+    checkpoint again: no row is seen twice, and none that came after the checkpoint and was flown again.
+    """
+
+    def __init__(self, directory: Path, rows: Sequence[dict[str, Any]] = ()) -> None:
+        """Start a file with the rows so far.
+
+        Raises:
+            BadInput: the extra `tensorboard` is not installed.
+        """
+        require("tensorboard", "tensorboard")
+        self._events: Any = require("tensorboard.compat.proto.event_pb2", "tensorboard")
+        records = require("tensorboard.summary.writer.record_writer", "tensorboard")
+        number = len(list(directory.glob("events.out.tfevents.*"))) + 1
+        # TensorBoard knows its files by the name and reads them in its order
+        self._file = open(directory / f"events.out.tfevents.{number:04d}", "xb")  # noqa: SIM115  (closed by `close`)
+        self._records = records.RecordWriter(self._file)
+        self._began = time.time() - (rows[-1]["seconds"] if rows else 0.0)
+        self._add(self._events.Event(wall_time=time.time(), file_version="brain.Event:2"))
+        start = self._events.SessionLog(status=self._events.SessionLog.START)
+        self._add(self._events.Event(wall_time=time.time(), step=0, session_log=start))
+        for row in rows:
+            self.write(row)
+
+    def write(self, row: dict[str, Any]) -> None:
+        """Add a row of the metrics, so that a TensorBoard that is watching sees it now."""
+        event = self._events.Event(wall_time=self._began + row["seconds"], step=row["steps"])
+        for name, value in scalars(row):
+            event.summary.value.add(tag=name, simple_value=value)
+        self._add(event)
+        self._file.flush()
+
+    def close(self) -> None:
+        """Close the file."""
+        self._file.close()
+
+    def _add(self, event: Any) -> None:
+        self._records.write(event.SerializeToString())
+
+
+def scalars(row: dict[str, Any], path: str = "") -> Iterator[tuple[str, float]]:
+    """Name and value of each finite number of a row, without the steps; `terms/attitude` for one in a table."""
+    for name, value in row.items():
+        if isinstance(value, dict):
+            yield from scalars(value, f"{path}{name}/")
+        elif isinstance(value, int | float) and math.isfinite(value) and path + name != "steps":
+            yield path + name, float(value)
