@@ -45,11 +45,13 @@ def _page(entries: Sequence[Entry], comparison: Comparison) -> str:
     names, flights = comparison.names, [entry.flights for entry in entries]
     judged = list(zip(names, comparison.judgements, strict=True))
     shares = plots.settled_share([(f"{index} {name}", judgement) for index, (name, judgement) in enumerate(judged, 1)])
+    reference = comparison_tables.pilot(comparison.reference, names[comparison.reference])
+    against = f"Each pilot less the reference {reference}, trial by trial:"
     tasks = [(name, entry.task) for name, entry in zip(names, entries, strict=True)]
     parts = {
         "Side by side": comparison_tables.pilots_table(judged) + _CAPTIONS["table"],
         "In words": _words(comparison),
-        "Paired differences": page.drawing(comparison_plots.paired(comparison), _CAPTIONS["paired"]),
+        "Paired differences": page.drawing(comparison_plots.paired(comparison), against + _CAPTIONS["paired"]),
         "The same trials": page.drawing(comparison_plots.responses(flights, comparison), _CAPTIONS["responses"]),
         "All trials": page.drawing(comparison_plots.boxes(comparison), _CAPTIONS["boxes"]),
         "Settled by when": page.drawing(shares, _CAPTIONS["share"]),
@@ -75,7 +77,8 @@ def _words(comparison: Comparison) -> str:
         if found:
             first, *more = (escape(text) for text in found)
             items = "".join(f"<li>{text}</li>" for text in more)
-            paragraphs.append(f"<p><strong>{first}</strong></p><ul>{items}</ul>")
+            state = " open" if len(comparison.names) == 2 else ""
+            paragraphs.append(f"<details{state}><summary>{first}</summary><ul>{items}</ul></details>")
     return "".join(paragraphs)
 
 
@@ -89,7 +92,7 @@ _CAPTIONS = {
 as infinite, and {tables.DASH} says that the quantile falls among those. Crossed: trials that crossed some bound of the
 pilot's task.</p>""",
     "paired": """
-Each pilot less the reference, trial by trial: the dot is the median, the bar its 95&nbsp;% bootstrap interval over
+the dot is the median, the bar its 95&nbsp;% bootstrap interval over
 trials. On the dashed line there is no difference; left of it the pilot has less, which is better for times, overshoot
 and errors, and neither good nor bad for speed and action. A triangle at the edge is an infinite median: in most trials
 one of the two fails and the other does not. An interval tells about these pilots, not about others trained or tuned
@@ -107,6 +110,6 @@ for an overshoot, so a low box over a small number is no success.""",
 Share of all trials settled by each instant. Higher and further left is better; a line that stays below 100&nbsp;%
 leaves trials unsettled.""",
     "numbers": f"""
-<p class="quiet">Median of the paired difference [95 % interval], and in how many trials the pilot has less : more.
-{comparison_tables.INFINITY} where one of the two fails and the other does not.</p>""",
+<p class="quiet">Median of the paired differences, its 95&nbsp;% interval, and in how many trials the pilot has
+less : more. {comparison_tables.INFINITY} where one of the two fails and the other does not.</p>""",
 }

@@ -19,7 +19,7 @@ from flytune.show import plots, style
 from flytune.show.style import heading, label
 
 TRIALS_SHOWN = 3  # of each pilot, the first ones; more lines than these hide each other
-FLOOR = 0.01  # of the band; an error below it is drawn there, as a logarithmic axis has no zero
+FLOOR = 0.002  # of the band; an error below it is drawn there, as a logarithmic axis has no zero
 BOXES = (
     "position.settling_time",
     "yaw.settling_time",
@@ -52,11 +52,6 @@ def unit(metric: Metric) -> tuple[str, float]:
     return ("%", 100.0) if metric.field == "overshoot" else SCALES[metric.unit]
 
 
-def numbered(names: Sequence[str], longest: int = 40) -> list[str]:
-    """The pilots' names behind their numbers, as texts of a figure."""
-    return [f"<b>{number}</b> {label(name, longest)}" for number, name in enumerate(names, start=1)]
-
-
 def responses(flights: Sequence[Flights], comparison: Comparison) -> go.Figure:
     """x, y, z, yaw and distance: the same few trials of every pilot, and the error of all trials as it dies out."""
     figure = make_subplots(
@@ -68,21 +63,33 @@ def responses(flights: Sequence[Flights], comparison: Comparison) -> go.Figure:
         subplot_titles=[heading("the same few trials"), heading("error over all trials: median and middle half")],
     )
     shown = min(TRIALS_SHOWN, flights[0].trials)
+    opacity = 0.16 if len(flights) < 4 else 0.07  # many shades above each other only darken the picture
     for row, channel in enumerate(CHANNELS, start=1):
-        for index, flown in enumerate(flights):
-            _draw_trials(figure, flown, channel, shown, index, row)
-            _draw_error(figure, flown, comparison.judgements[index].crashed, channel, index, row)
-        _, target, band = _course(flights[0], channel)
-        plots.target_and_band(figure, row, 1, target, band)
-        place: dict[str, Any] = {"row": row, "col": 2}
-        figure.add_hrect(FLOOR * band, band, fillcolor=style.BAND, line_width=0, layer="below", **place)
         unit = "deg" if channel == "yaw" else "m"
-        sign = "distance" if channel == "position" else channel
-        figure.update_yaxes(title_text=f"{sign} [{unit}]", row=row, col=1)
-        figure.update_yaxes(title_text=f"|{channel} error| [{unit}]", type="log", dtick=1, row=row, col=2)
+        _, target, band = _course(flights[0], channel)
+        errors = []
+        for index, flown in enumerate(flights):
+            figure.add_trace(_trials(flown, channel, shown, index), row=row, col=1)
+            errors += _errors(flown, comparison.judgements[index].crashed, channel, index, opacity)
+        figure.add_traces(errors, rows=row, cols=2)
+        plots.target_and_band(figure, row, 1, target, band)
+        low, high = _reach(errors, band)
+        place: dict[str, Any] = {"row": row, "col": 2}
+        figure.add_hrect(low / 2, band, fillcolor=style.BAND, line_width=0, layer="below", **place)
+        decades: dict[str, Any] = {"type": "log", "dtick": 1, "range": [math.log10(low), math.log10(high)]}
+        figure.update_yaxes(title_text=f"|{channel} error| [{unit}]", **decades, **place)
+        title_text = f"{'distance' if channel == 'position' else channel} [{unit}]"
+        figure.update_yaxes(title_text=title_text, row=row, col=1)
     figure.update_xaxes(range=[0, flights[0].duration], hoverformat=".2f")
     figure.update_xaxes(title_text="time [s]", row=len(CHANNELS))
-    return _name(style.frame(figure, 1120, hovermode="x", margin=_margin(comparison.names)), comparison.names)
+    return _finish(figure, comparison.names, range(len(flights)), 1000, hovermode="x")
+
+
+def _reach(errors: Sequence[go.Scatter], band: float) -> tuple[float, float]:
+    """Ends of an axis that shows all curves, and the edge of the band, with some room."""
+    values = np.concatenate([np.asarray(trace.y, dtype=np.float64) for trace in errors])
+    known = np.append(values[np.isfinite(values)], band)
+    return known.min() / 1.6, known.max() * 1.6
 
 
 def _course(flights: Flights, channel: str) -> tuple[Float[np.ndarray, "N K"], float, float]:
@@ -99,48 +106,38 @@ def _error(flights: Flights, channel: str) -> Float[np.ndarray, "N K"]:
     return np.abs(np.degrees(metrics.wrap_angle(np.radians(error))) if channel == "yaw" else error)
 
 
-def _draw_trials(figure: go.Figure, flights: Flights, channel: str, shown: int, index: int, row: int) -> None:
+def _trials(flights: Flights, channel: str, shown: int, index: int) -> go.Scatter:
     """The first trials of one pilot as one trace, so that its name hides and shows them together."""
     step = plots.stride(flights)
     values = _course(flights, channel)[0][:shown, ::step]
     gap = np.full((shown, 1), np.nan)
     time = np.broadcast_to(flights.time[::step], values.shape)
-    trace = go.Scatter(
+    return go.Scatter(
         x=np.concatenate([time, gap], axis=1).ravel().astype(np.float32),
         y=np.concatenate([values, gap], axis=1).ravel().astype(np.float32),
         mode="lines",
         line={"color": style.colour(index), "width": 1.3, "simplify": False},
-        legendgroup=str(index),
-        showlegend=False,
         hovertemplate="%{y:.3f}",
         meta=index,
     )
-    figure.add_trace(trace, row=row, col=1)
 
 
-def _draw_error(figure: go.Figure, flights: Flights, crashed: np.ndarray, channel: str, index: int, row: int) -> None:
+def _errors(flights: Flights, crashed: np.ndarray, channel: str, index: int, opacity: float) -> list[go.Scatter]:
     """Median and middle half of the error over all trials; a crashed trial is infinitely far at every instant."""
     step = plots.stride(flights)
     error = np.where(crashed[:, None], np.inf, _error(flights, channel)[:, ::step])
     floor = FLOOR * _course(flights, channel)[2]
     low, middle, high = (_quantile(error, share, floor) for share in (0.25, 0.5, 0.75))
     colour = style.colour(index)
-    common: dict[str, Any] = {
-        "x0": 0,
-        "dx": step * float(flights.time[1]),
-        "mode": "lines",
-        "legendgroup": str(index),
-        "showlegend": False,
-        "meta": index,
-    }
-    edge = {"width": 0, "color": colour}
-    figure.add_trace(go.Scatter(**common, y=low, line=edge, hoverinfo="skip"), row=row, col=2)
-    shade = f"rgba({', '.join(str(int(colour[at : at + 2], 16)) for at in (1, 3, 5))}, 0.15)"
-    band = go.Scatter(**common, y=high, line=edge, fill="tonexty", fillcolor=shade, hoverinfo="skip")
-    figure.add_trace(band, row=row, col=2)
+    common: dict[str, Any] = {"x0": 0, "dx": step * float(flights.time[1]), "mode": "lines", "meta": index}
+    edge: dict[str, Any] = {"line": {"width": 0, "color": colour}, "hoverinfo": "skip"}
+    shade = f"rgba({', '.join(str(int(colour[at : at + 2], 16)) for at in (1, 3, 5))}, {opacity})"
     line = {"color": colour, "width": 1.8, "simplify": False}
-    median = go.Scatter(**{**common, "showlegend": row == 1}, y=middle, line=line, hovertemplate="%{y:.4f}")
-    figure.add_trace(median, row=row, col=2)
+    return [
+        go.Scatter(**common, **edge, y=low),
+        go.Scatter(**common, **edge, y=high, fill="tonexty", fillcolor=shade),
+        go.Scatter(**common, y=middle, line=line, hovertemplate="%{y:.4f}"),
+    ]
 
 
 def _quantile(error: Float[np.ndarray, "N K"], share: float, floor: float) -> Float[np.ndarray, "K"]:
@@ -167,7 +164,7 @@ def boxes(comparison: Comparison) -> go.Figure | str:
             drawn += finite.size
             ticks.append(f"<b>{index + 1}</b><br>{finite.size}")
             trace = plots.box(finite, index, "", style.colour(index))
-            trace.update(legendgroup=str(index), showlegend=panel == 0, meta=index)
+            trace.update(meta=index)
             figure.add_trace(trace, row=row + 1, col=column + 1)
         place: dict[str, Any] = {"row": row + 1, "col": column + 1}
         count = len(comparison.judgements)
@@ -176,7 +173,7 @@ def boxes(comparison: Comparison) -> go.Figure | str:
     if not drawn:
         return "Every trial of every pilot crashed, so there is nothing to draw."
     figure.update_xaxes(showgrid=False, tickangle=0, tickfont_size=11)
-    return _name(style.frame(figure, 700, margin=_margin(comparison.names)), comparison.names)
+    return _finish(figure, comparison.names, range(len(comparison.names)), 580)
 
 
 def paired(comparison: Comparison) -> go.Figure:
@@ -184,28 +181,27 @@ def paired(comparison: Comparison) -> go.Figure:
     columns = 4
     rows = math.ceil(len(METRICS) / columns)
     others = [index for index in range(len(comparison.names)) if index != comparison.reference]
-    panel_height = 62 + 24 * len(others)
-    margin = _margin(comparison.names)
-    height = margin["t"] + margin["b"] + rows * (panel_height + 44)
+    gap = 92  # px between the panels of a column, for ticks and titles
+    height = rows * (38 + 24 * len(others)) + (rows - 1) * gap
     figure = make_subplots(
         rows,
         columns,
-        vertical_spacing=84 / (height - margin["t"] - margin["b"]),
+        vertical_spacing=gap / height,
         horizontal_spacing=0.05,
-        subplot_titles=[f"{heading(title(metric))} [{unit(metric)[0]}]" for metric in METRICS],
+        subplot_titles=[heading(title(metric)) for metric in METRICS],
     )
     for panel, metric in enumerate(METRICS):
         row, column = (number + 1 for number in divmod(panel, columns))
         found = [one for one in comparison.differences if one.metric is metric]
         _draw_differences(figure, found, others, row, column)
         more, less = WAYS[metric.field]
-        figure.update_xaxes(title_text=f"← {less} · {more} →", row=row, col=column)
+        figure.update_xaxes(title_text=f"← {less}  [{unit(metric)[0]}]  {more} →", row=row, col=column)
     ticks = {"tickvals": list(range(len(others))), "ticktext": [f"<b>{index + 1}</b>" for index in others]}
     figure.update_yaxes(**ticks, range=[len(others) - 0.4, -0.6])
-    figure = style.frame(figure, round(height), margin=margin)
+    figure.update_xaxes(nticks=5, tickfont_size=11, exponentformat="none")
+    figure = _finish(figure, comparison.names, others, height)
     figure.update_yaxes(showgrid=False)
-    figure.update_xaxes(nticks=5, title_font_size=11.5, title_font_color=style.QUIET, tickfont_size=11)
-    return _name(figure, comparison.names)
+    return figure.update_xaxes(title_font_size=11.5, title_font_color=style.QUIET)
 
 
 def _draw_differences(
@@ -218,34 +214,29 @@ def _draw_differences(
     spread = float(np.ptp(known)) or 1.0
     left, right = float(known.min()) - 0.18 * spread, float(known.max()) + 0.18 * spread
     place: dict[str, Any] = {"row": row, "col": column}
-    figure.add_vline(0, line={"color": style.QUIET, "width": 1, "dash": "dash"}, layer="below", **place)
     for height, (pilot, difference, three) in enumerate(zip(pilots, differences, ends, strict=True)):
         low, middle, high = np.clip(three, left, right)
         colour = style.colour(pilot)
         symbol = "circle" if np.isfinite(three[1]) else f"triangle-{'right' if three[1] > 0 else 'left'}"
-        common: dict[str, Any] = {"legendgroup": str(pilot), "showlegend": False, "meta": pilot}
-        figure.add_trace(
-            go.Scatter(
-                x=[low, high],
-                y=[height, height],
-                mode="lines",
-                line={"color": colour, "width": 3},
-                hoverinfo="skip",
-                **common,
-            ),
-            **place,
+        bar = go.Scatter(
+            x=[low, high],
+            y=[height, height],
+            mode="lines",
+            line={"color": colour, "width": 3},
+            hoverinfo="skip",
+            meta=pilot,
         )
-        figure.add_trace(
-            go.Scatter(
-                x=[middle],
-                y=[height],
-                mode="markers",
-                marker={"color": colour, "size": 10, "symbol": symbol, "line": {"color": "white", "width": 1}},
-                hovertemplate=_told(difference, three),
-                **{**common, "showlegend": (row, column) == (1, 1)},
-            ),
-            **place,
+        dot = go.Scatter(
+            x=[middle],
+            y=[height],
+            mode="markers",
+            marker={"color": colour, "size": 10, "symbol": symbol, "line": {"color": "white", "width": 1}},
+            cliponaxis=False,
+            hovertemplate=_told(difference, three),
+            meta=pilot,
         )
+        figure.add_traces([bar, dot], rows=row, cols=column)
+    figure.add_vline(0, line={"color": style.QUIET, "width": 1, "dash": "dash"}, layer="below", **place)
     figure.update_xaxes(range=[left, right], **place)
 
 
@@ -258,12 +249,18 @@ def _told(difference: Difference, ends: Float[np.ndarray, "3"]) -> str:
     )
 
 
-def _margin(names: Sequence[str]) -> dict[str, int]:
-    """Margins with room above for a legend: names take a line for every two or three."""
-    return {"l": 66, "r": 14, "t": 74 + 20 * ((len(names) - 1) // 2), "b": 48}
+def _finish(figure: go.Figure, names: Sequence[str], pilots: Sequence[int], height: int, **layout: Any) -> go.Figure:
+    """The figure in the house style, every trace named after its pilot, and a legend of the pilots above it.
 
-
-def _name(figure: go.Figure, names: Sequence[str]) -> go.Figure:
-    """The figure with each trace named after the pilot it belongs to."""
-    texts = numbered(names)
-    return figure.for_each_trace(lambda trace: trace.update(name=texts[trace.meta], meta=None))
+    The legend has entries of its own, since a pilot may have nothing to draw in a panel.
+    """
+    texts = [f"<b>{number}</b> {label(name)}" for number, name in enumerate(names, start=1)]
+    figure.for_each_trace(lambda trace: trace.update(name=texts[trace.meta], legendgroup=str(trace.meta), meta=None))
+    figure.update_traces(showlegend=False)
+    for pilot in pilots:
+        marker = {"color": style.colour(pilot), "symbol": "square", "size": 11}
+        entry = go.Scatter(x=[None], y=[None], mode="markers", marker=marker, name=texts[pilot], hoverinfo="skip")
+        figure.add_trace(entry.update(legendgroup=str(pilot)))
+    margin = {"l": 66, "r": 14, "t": style.room_for_names(len(pilots)), "b": 48}
+    figure = style.frame(figure, height + margin["t"] + margin["b"], margin=margin, **layout)
+    return style.legend_below_tools(figure)

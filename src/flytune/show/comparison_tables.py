@@ -59,12 +59,15 @@ def paired_table(comparison: Comparison) -> str:
         symbol, scale = unit(metric)
         found = [one for one in comparison.differences if one.metric is metric]
         cells = (
-            f"<strong>{_signed(one.median * scale)}</strong> [{_signed(one.low * scale)}, {_signed(one.high * scale)}]"
-            f"<br>{one.better} : {one.worse}" + f", {one.left_out} left out" * (one.left_out > 0)
+            f"<strong>{_signed(one.median * scale)}</strong>"
+            f"<br>{_signed(one.low * scale)} to {_signed(one.high * scale)}"
+            f"<br>{one.better} : {one.worse}" + f" ({one.left_out} left out)" * (one.left_out > 0)
             for one in found
         )
         rows.append((f"{title(metric)} [{symbol}]", *cells))
-    return table(f"<tr><th>less {escape(comparison.names[comparison.reference])}</th>{titles}</tr>", rows, "dense")
+    return table(
+        f"<tr><th>less {escape(comparison.names[comparison.reference])}</th>{titles}</tr>", rows, "dense narrow"
+    )
 
 
 def pilot(index: int, name: str) -> str:

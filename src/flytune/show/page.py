@@ -40,6 +40,9 @@ tbody th { text-align: left; padding-left: 0; font-weight: 600; }
 table.dense { font-size: 0.87rem; }
 table.dense th, table.dense td { padding-left: 5px; padding-right: 5px; }
 table.dense tbody th { white-space: normal; overflow-wrap: anywhere; min-width: 9rem; padding-left: 0; }
+table.narrow { width: auto; }
+details { margin: 6px 0 12px; }
+summary { cursor: pointer; font-weight: 600; }
 dl { display: grid; grid-template-columns: max-content 1fr; gap: 3px 20px; margin: 14px 0; font-size: 0.93rem; }
 dt { color: #52606d; }
 dd { margin: 0; overflow-wrap: anywhere; font-variant-numeric: tabular-nums; }

@@ -217,8 +217,8 @@ def settled_share(judgements: Sequence[tuple[str, Judgement]]) -> go.Figure:
     figure.update_xaxes(title_text="time [s]", range=[0, longest])
     figure.update_yaxes(range=[-2, 103])
     figure.update_yaxes(title_text="settled [% of trials]", col=1)
-    above = 60 + 20 * ((len(judgements) - 1) // 3)  # the names take a line for every three or so
-    return style.frame(figure, 300 + above, margin={"l": 66, "r": 14, "t": above, "b": 48})
+    above = style.room_for_names(len(judgements))
+    return style.legend_below_tools(style.frame(figure, 300 + above, margin={"l": 66, "r": 14, "t": above, "b": 48}))
 
 
 def margins(flights: Flights, judgement: Judgement) -> go.Figure | str:

@@ -44,6 +44,17 @@ def frame(figure: go.Figure, height: int, **layout: Any) -> go.Figure:
     return figure
 
 
+def room_for_names(number: int) -> int:
+    """Pixels above the panels for the buttons, a legend of so many names that may all be long, and the titles."""
+    return 76 + 20 * ((number - 1) // 2)
+
+
+def legend_below_tools(figure: go.Figure) -> go.Figure:
+    """The figure with its legend under the row of buttons, which would lie upon a long one."""
+    height: Any = figure.layout.height  # pyright: ignore[reportAttributeAccessIssue]
+    return figure.update_layout(legend_y=1 - 28 / height)
+
+
 def heading(text: str) -> str:
     """The title of a panel."""
     return f"<b>{text}</b>"
