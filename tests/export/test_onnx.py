@@ -1,5 +1,10 @@
 """A policy as an ONNX file: what is in it, that it answers as the policy does, and that it flies the same flights."""
 
+import re
+import subprocess
+import sys
+from pathlib import Path
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -182,3 +187,16 @@ def test_a_run_that_fails_in_flight_gives_an_action_that_is_not_finite(exported)
 
 def test_the_conventions_are_those_of_the_contract():
     assert CONVENTIONS == {"observation": LAYOUT, "action": ACTION, "rate": "100 Hz"}
+
+
+def test_the_python_of_the_documentation_flies_the_file(exported, policy):
+    page = (Path(__file__).parents[2] / "docs" / "onnx.md").read_text(encoding="utf-8")
+    (snippet,) = re.findall(r"```python\n(.*?)```", page, flags=re.DOTALL)
+    answer = subprocess.run(
+        [sys.executable, "-c", snippet], cwd=exported.parent, capture_output=True, text=True, check=False
+    )
+    assert answer.returncode == 0, answer.stderr
+    vehicle, numbers = answer.stdout.split(" ", 1)
+    assert vehicle == policy.about["vehicle"]
+    expected = policy(jnp.zeros(17).at[0].set(0.5).at[6].set(1.0))
+    np.testing.assert_allclose(np.fromstring(numbers.strip(" []\n"), sep=" "), expected, rtol=1e-4)
