@@ -1,0 +1,1 @@
+"""The paper, run again and judged claim by claim."""
