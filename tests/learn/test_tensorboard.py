@@ -4,7 +4,6 @@ import json
 import os
 import subprocess
 import sys
-from contextlib import closing
 
 import numpy as np
 import pytest
@@ -44,7 +43,7 @@ def columns(seen):
 
 def test_tensorboard_reads_every_number_of_every_row_of_a_training_over_its_steps(small_task, tmp_path):
     run = train(small_task, "ppo", out=tmp_path)
-    with closing(EventLog(tmp_path)) as log:
+    with EventLog(tmp_path) as log:
         for row in run.metrics:
             log.write(row)
     seen = read(tmp_path)
@@ -75,7 +74,7 @@ def test_the_scalars_of_a_row_are_its_finite_numbers_by_their_path():
 
 
 def test_the_time_of_an_event_is_that_of_its_row(tmp_path):
-    with closing(EventLog(tmp_path)) as log:
+    with EventLog(tmp_path) as log:
         for update in (1, 5):
             log.write(make_row(update))
     first, second = read(tmp_path)["reward"]
@@ -83,19 +82,19 @@ def test_the_time_of_an_event_is_that_of_its_row(tmp_path):
 
 
 def test_a_row_can_be_seen_before_the_file_is_closed(tmp_path):
-    with closing(EventLog(tmp_path)) as log:
+    with EventLog(tmp_path) as log:
         log.write(make_row(1))
         assert columns(read(tmp_path))["terms/xy"] == [(640, 0.5)]
 
 
 def test_a_resumed_run_says_each_row_once_and_forgets_what_came_after_the_checkpoint(tmp_path):
     rows = [make_row(update) for update in range(1, 7)]
-    with closing(EventLog(tmp_path)) as log:
+    with EventLog(tmp_path) as log:
         for row in rows[:4]:
             log.write(row)
     # interrupted after four updates, the checkpoint is of the second; updates 3 to 6 are flown (again), and differ
     later = [row | {"gradient_norm": 7.0} for row in rows[2:]]
-    with closing(EventLog(tmp_path, rows[:2])) as log:
+    with EventLog(tmp_path, rows[:2]) as log:
         for row in later:
             log.write(row)
     expected = [(row["steps"], row["gradient_norm"]) for row in (*rows[:2], *later)]

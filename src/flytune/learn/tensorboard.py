@@ -4,9 +4,18 @@ import math
 import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 from flytune.extras import require
+
+
+def check_tensorboard() -> None:
+    """Refuse to go on without the package, before anything is written.
+
+    Raises:
+        BadInput: the extra `tensorboard` is not installed.
+    """
+    require("tensorboard", "tensorboard")
 
 
 class EventLog:
@@ -22,7 +31,7 @@ class EventLog:
         Raises:
             BadInput: the extra `tensorboard` is not installed.
         """
-        require("tensorboard", "tensorboard")
+        check_tensorboard()
         self._events: Any = require("tensorboard.compat.proto.event_pb2", "tensorboard")
         records = require("tensorboard.summary.writer.record_writer", "tensorboard")
         number = len(list(directory.glob("events.out.tfevents.*"))) + 1
@@ -47,6 +56,12 @@ class EventLog:
     def close(self) -> None:
         """Close the file."""
         self._file.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
 
     def _add(self, event: Any) -> None:
         self._records.write(event.SerializeToString())
