@@ -10,6 +10,8 @@ import torch
 from gymnasium import spaces
 from stable_baselines3 import PPO
 
+torch.set_num_threads(1)  # at this size more are slower, and very much so beside other tests
+
 
 class Room(gymnasium.Env):
     """An environment with flytune's spaces in which nothing happens; a model needs one to be made."""

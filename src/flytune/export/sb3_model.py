@@ -53,7 +53,12 @@ def load_sb3(path: Path) -> Policy:
     problem = _unknown_kind(about) or _unknown_shape(tensors) or _not_finite(tensors)
     if problem:
         raise BadInput(f"{path}: {problem} {REMEDY}")
-    return _policy(tensors, {"trainer": "Stable-Baselines3", "version": version[:40]})
+    return Policy(
+        actor=actor_network(tensors),
+        input_scale=jnp.ones(SIZE),
+        squash="clip",
+        about={"trainer": f"Stable-Baselines3 {version[:40]}"},
+    )
 
 
 def _check_size(archive: zipfile.ZipFile, largest: float) -> None:
@@ -168,6 +173,15 @@ def _unknown_kind(about: Any) -> str | None:
     return None
 
 
+def actor_network(tensors: dict[str, np.ndarray]) -> Network:
+    """The actor among the tensors of an MlpPolicy, by the names its `state_dict` gives them."""
+    layers = _layers(tensors)
+    return Network(
+        weights=tuple(jnp.asarray(tensors[f"{layer}.weight"].T) for layer in layers),
+        biases=tuple(jnp.asarray(tensors[f"{layer}.bias"]) for layer in layers),
+    )
+
+
 def _layers(tensors: dict[str, np.ndarray]) -> list[str]:
     """The names of the actor's layers, first to last."""
     hidden = [f"mlp_extractor.policy_net.{2 * index}" for index in range(len(tensors))]
@@ -192,16 +206,3 @@ def _unknown_shape(tensors: dict[str, np.ndarray]) -> str | None:
 def _not_finite(tensors: dict[str, np.ndarray]) -> str | None:
     bad = [name for name, tensor in tensors.items() if not np.all(np.isfinite(tensor))]
     return f"{bad[0]} holds numbers that are not finite." if bad else None
-
-
-def _policy(tensors: dict[str, np.ndarray], about: dict[str, Any]) -> Policy:
-    layers = _layers(tensors)
-    return Policy(
-        actor=Network(
-            weights=tuple(jnp.asarray(tensors[f"{layer}.weight"].T) for layer in layers),
-            biases=tuple(jnp.asarray(tensors[f"{layer}.bias"]) for layer in layers),
-        ),
-        input_scale=jnp.ones(SIZE),
-        squash="clip",
-        about=about,
-    )

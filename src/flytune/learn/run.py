@@ -17,12 +17,12 @@ import numpy as np
 
 from flytune.control.policy import Policy
 from flytune.errors import BadInput, Diverged, Interrupted
-from flytune.learn import apg, ppo
+from flytune.learn import apg, ppo, sb3
 from flytune.learn.directory import RunDirectory, resume_command
 from flytune.task.task import Task, write_task
 from flytune.task.termination import causes
 
-TRAINERS: dict[str, ModuleType] = {"apg": apg, "ppo": ppo}
+TRAINERS: dict[str, ModuleType] = {"apg": apg, "ppo": ppo, "sb3": sb3}
 CHECKPOINT_INTERVAL = 30.0  # s between checkpoints
 
 
@@ -69,7 +69,7 @@ def train(
 
     Args:
         task: what to learn; `task.apg` or `task.ppo` say how.
-        trainer: `apg` or `ppo`.
+        trainer: `apg`, `ppo`, or `sb3`, which is Stable-Baselines3's PPO with the settings of `task.ppo`.
         seed: of the weights, the episodes and the noise; 0 or more.
         out: run directory to write; nothing is written where None.
         resume: go on from the checkpoint in `out`.
@@ -84,7 +84,9 @@ def train(
         raise BadInput(f"trainer: {trainer!r} is not allowed. Allowed: {', '.join(TRAINERS)}.")
     if not 0 <= seed < 2**32:
         raise BadInput(f"seed: {seed} is not allowed. Allowed: a whole number, 0 to {2**32 - 1}.")
-    settings = getattr(task, trainer)
+    if trainer == "sb3":
+        sb3.check_installed()
+    settings = task.apg if trainer == "apg" else task.ppo
     teacher = TRAINERS[trainer]
     rows: list[dict[str, Any]] = []
     with _deferred_interrupt() as interrupted:
