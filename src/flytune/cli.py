@@ -56,7 +56,8 @@ def _parser() -> argparse.ArgumentParser:
         epilog="Start with: flytune train baseline. Exit codes: 0 done, 2 bad input, 3 diverged, 130 interrupted.",
     )
     commands = parser.add_subparsers(dest="command", metavar="COMMAND", required=True)
-    for add in (_add_train, _add_evaluate, _add_report, _add_show, _add_bench):
+    for add in (_add_train, _add_evaluate, _add_compare, _add_report, _add_reproduce,
+                _add_export, _add_show, _add_bench):  # fmt: skip
         add(commands)
     return parser
 
@@ -70,13 +71,17 @@ def _command(commands: Any, name: str, run: Callable[[argparse.Namespace], None]
 
 
 TASK_HELP = "a preset (baseline, acrobatic, inspection) or a TOML file"
-WHO_HELP = "a run directory or a .safetensors policy"
+WHO_HELP = (
+    "a run directory, a policy (.safetensors, .onnx, or a .zip of Stable-Baselines3), or pid, geometric, lqr "
+    "(add @textbook for gains that were not tuned)"
+)
+WORLDS = ("flytune", "pybullet", "mujoco")
 
 
 def _add_train(commands: Any) -> None:
     command = _command(commands, "train", _train, "train a policy for a task; prints the run directory last")
     command.add_argument("task", metavar="TASK", help=TASK_HELP)
-    command.add_argument("--trainer", choices=("apg", "ppo"), default="apg", help="how to learn")
+    command.add_argument("--trainer", choices=("apg", "ppo", "sb3"), default="apg", help="how to learn")
     command.add_argument("--seed", type=int, default=0, help="of weights, episodes and noise")
     command.add_argument("--steps", type=int, default=argparse.SUPPRESS, metavar="N",
                          help="environment steps in all (default: the task's own)")  # fmt: skip
@@ -85,12 +90,15 @@ def _add_train(commands: Any) -> None:
     command.add_argument("--set", nargs="+", action="extend", default=[], metavar="PATH=VALUE", dest="edits",
                          help="edit the task: reward.velocity.weight=0.08 vehicle=crazyflie-measured ...")  # fmt: skip
     command.add_argument("--resume", action="store_true", help="go on from the checkpoint in --out")
+    command.add_argument("--tensorboard", action="store_true", help="write event files for TensorBoard as well")
 
 
 def _add_trial_options(command: argparse.ArgumentParser) -> None:
     command.add_argument("--task", default=argparse.SUPPRESS, metavar="TASK",
                          help=f"{TASK_HELP} (default: the one it was trained for)")  # fmt: skip
-    command.add_argument("--world", choices=("flytune",), default="flytune", help="the simulator to fly in")
+    command.add_argument("--world", choices=WORLDS, default="flytune", help="the simulator to fly in")
+    command.add_argument("--world-set", nargs="+", action="extend", default=[], metavar="NAME=VALUE",
+                         dest="world_edits", help="options of the simulator: damping=0.04 ground_effect=true ...")  # fmt: skip
     command.add_argument("--trials", type=int, default=100, help="number of trials")
     command.add_argument("--seed", type=int, default=1, help="of starts and noise")
     command.add_argument("--duration", type=float, default=argparse.SUPPRESS, metavar="S",
@@ -110,6 +118,19 @@ def _add_evaluate(commands: Any) -> None:
                          help="write the trajectories, with named columns")  # fmt: skip
 
 
+def _add_compare(commands: Any) -> None:
+    command = _command(
+        commands, "compare", _compare, "fly two or more pilots from the same starts and judge them side by side"
+    )
+    command.add_argument("who", metavar="WHO", nargs="+", help=WHO_HELP)
+    _add_trial_options(command)
+    command.add_argument("--json", action="store_true", help="print one JSON object instead of the tables")
+    command.add_argument("--out", type=Path, default=argparse.SUPPRESS, metavar="DIR",
+                         help="where to write comparison.html and comparison.json (default: nowhere)")  # fmt: skip
+    command.add_argument("--flights", type=Path, default=argparse.SUPPRESS, metavar="FILE.npz",
+                         help="write the trajectories, as FILE-1.npz, FILE-2.npz, ...")  # fmt: skip
+
+
 def _add_report(commands: Any) -> None:
     command = _command(
         commands, "report", _report, "print the tables of one or more pilots, and write one self-contained HTML page"
@@ -117,6 +138,29 @@ def _add_report(commands: Any) -> None:
     command.add_argument("who", metavar="WHO", nargs="+", help=WHO_HELP)
     _add_trial_options(command)
     command.add_argument("--out", type=Path, default=Path("report.html"), metavar="FILE", help="the page")
+
+
+def _add_reproduce(commands: Any) -> None:
+    command = _command(
+        commands, "reproduce", _reproduce, "run the paper again: three behaviours, every figure, a verdict per claim"
+    )
+    command.add_argument("--trainer", choices=("ppo", "apg"), default="ppo", help="how to learn; the paper's is ppo")
+    command.add_argument("--seeds", type=int, default=5, help="trainings of each behaviour")
+    command.add_argument("--steps", type=int, default=argparse.SUPPRESS, metavar="N",
+                         help="environment steps of each training (default: the task's own)")  # fmt: skip
+    command.add_argument("--refined", action="store_true", help="the refined presets in place of the printed ones")
+    command.add_argument("--out", type=Path, default=argparse.SUPPRESS, metavar="DIR",
+                         help="where runs, figures, verdicts and the page go; what is there is gone on with "
+                         "(default: runs/reproduction-TRAINER)")  # fmt: skip
+    command.add_argument("--json", action="store_true", help="print one JSON object instead of the table")
+
+
+def _add_export(commands: Any) -> None:
+    command = _command(commands, "export", _export, "write a policy for elsewhere")
+    command.add_argument("who", metavar="WHO", help="a run directory or a policy (.safetensors, .onnx, .zip)")
+    command.add_argument("--format", choices=("onnx", "safetensors"), required=True,
+                         help="onnx: for any runtime; safetensors: flytune's own, for instance of a .zip")  # fmt: skip
+    command.add_argument("--out", type=Path, required=True, metavar="PATH", help="the file")
 
 
 def _add_show(commands: Any) -> None:
@@ -148,7 +192,7 @@ def _train(options: argparse.Namespace) -> None:
     with show_progress() as on_progress:
         run = train(task, options.trainer, seed=options.seed, out=out, resume=options.resume, on_progress=on_progress)
     judgement = judge(fly(run.policy, task, who=str(out)))
-    _write_evaluation(out, judgement.to_dict())
+    _write_json(out / "evaluation.json", judgement.to_dict())
     print(judgement.line())
     print(out)
 
@@ -157,65 +201,120 @@ def _evaluate(options: argparse.Namespace) -> None:
     from flytune.learn.pilot import find_pilot
     from flytune.response.judge import judge
 
-    if "flights" in options:
-        _check_file("flights", options.flights)
-    if "out" in options and os.path.exists(options.out) and not os.path.isdir(options.out):
-        raise BadInput(f"out: {options.out} is a file. Give a directory.")
-    pilot = find_pilot(options.who)
-    flights, _ = _fly(pilot, options)
+    _check_outputs(options)
+    pilot = find_pilot(options.who, getattr(options, "task", None))
+    flights = _fly(pilot, options)
     judgement = judge(flights)
     if "flights" in options:
         flights.save(options.flights)
     print(json.dumps(judgement.to_dict()) if options.json else judgement.table(), flush=True)
     if "out" in options:
-        _write_evaluation(options.out, judgement.to_dict())
+        _write_json(options.out / "evaluation.json", judgement.to_dict())
     elif os.path.isdir(options.who):
         try:
-            _write_evaluation(Path(options.who), judgement.to_dict())
+            _write_json(Path(options.who) / "evaluation.json", judgement.to_dict())
         except BadInput as error:  # somebody else's run, perhaps; the result itself has been printed
             print(f"not kept: {error}", file=sys.stderr)
 
 
 def _report(options: argparse.Namespace) -> None:
-    from flytune.learn.pilot import find_pilot
-    from flytune.response.judge import judge
-    from flytune.show.report import Entry, write_report
+    from flytune.show.report import write_report
 
     _check_file("out", options.out)
-    entries = []
-    for pilot in [find_pilot(who) for who in options.who]:
-        flights, task = _fly(pilot, options)
-        judgement = judge(flights)
-        print(judgement.table(), end="\n\n")
-        entries.append(
-            Entry(
-                name=pilot.name,
-                task=task,
-                flights=flights,
-                judgement=judgement,
-                metrics=pilot.metrics,
-                about=pilot.about,
-            )
-        )
+    entries = _entries(options)
+    print("\n\n".join(entry.judgement.table() for entry in entries), end="\n\n")
     write_report(options.out, entries)
     print(options.out)
 
 
+def _compare(options: argparse.Namespace) -> None:
+    from flytune.response.compare import compare
+    from flytune.show.comparison import write_comparison
+
+    _check_outputs(options)
+    if len(options.who) < 2:
+        raise BadInput(f"who: one pilot, {options.who[0]}, cannot be compared. Give two or more.")
+    entries = _entries(options)
+    comparison = compare([entry.judgement for entry in entries])
+    if "flights" in options:
+        for number, entry in enumerate(entries, start=1):
+            entry.flights.save(options.flights.with_stem(f"{options.flights.stem}-{number}"))
+    print(json.dumps(comparison.to_dict()) if options.json else comparison.table(), flush=True)
+    if "out" in options:
+        _write_json(options.out / "comparison.json", comparison.to_dict())
+        write_comparison(options.out / "comparison.html", entries, comparison)
+
+
+def _entries(options: argparse.Namespace) -> list[Any]:
+    """Every pilot named, flown from the same starts and judged; all are found before the first one flies."""
+    from flytune.learn.pilot import find_pilot
+    from flytune.response.judge import judge
+    from flytune.show.report import Entry
+
+    entries = []
+    for pilot in [find_pilot(who, getattr(options, "task", None)) for who in options.who]:
+        flights = _fly(pilot, options)
+        entries.append(
+            Entry(
+                name=pilot.name,
+                task=pilot.task,
+                flights=flights,
+                judgement=judge(flights),
+                metrics=pilot.metrics,
+                about=pilot.about,
+            )
+        )
+    return entries
+
+
 def _fly(pilot: Any, options: argparse.Namespace) -> Any:
-    from flytune.learn.pilot import task_for
+    from flytune import document
     from flytune.response.fly import fly
 
-    task = task_for(pilot, getattr(options, "task", None))
-    flights = fly(
+    return fly(
         pilot.controller,
-        task,
+        pilot.task,
         trials=options.trials,
         seed=options.seed,
         starts=options.starts,
         duration=getattr(options, "duration", None),
         who=pilot.name,
+        world=options.world,
+        world_options=dict(map(document.parse_assignment, options.world_edits)),
     )
-    return flights, task
+
+
+def _reproduce(options: argparse.Namespace) -> None:
+    from flytune.reproduce.reproduction import reproduce
+    from flytune.reproduce.study import Study
+    from flytune.reproduce.trainings import show_all
+
+    name = f"reproduction-{options.trainer}{'-refined' if options.refined else ''}"
+    study = Study(
+        folder=getattr(options, "out", Path("runs") / name),
+        trainer=options.trainer,
+        seeds=options.seeds,
+        steps=getattr(options, "steps", None),
+        refined=options.refined,
+    )
+    with show_all(study) as (on_progress, tell):
+        result = reproduce(study, on_progress=on_progress, tell=tell)
+    print(json.dumps(result.to_dict()) if options.json else result.table(), flush=True)
+    if not options.json:
+        print(study.folder / "report.html")
+
+
+def _export(options: argparse.Namespace) -> None:
+    from flytune.control.policy import Policy, save_policy
+    from flytune.export.onnx import save_onnx
+    from flytune.learn.pilot import find_pilot
+
+    _check_file("out", options.out)
+    policy = find_pilot(options.who).controller
+    if not isinstance(policy, Policy):
+        raise BadInput(f"{options.who}: is no policy of flytune's own. Allowed: a run directory, .safetensors, .zip.")
+    {"onnx": save_onnx, "safetensors": save_policy}[options.format](options.out, policy)
+    print(options.out)
 
 
 def _show(options: argparse.Namespace) -> None:
@@ -231,6 +330,13 @@ def _bench(options: argparse.Namespace) -> None:
     print(json.dumps(result.to_dict()) if options.json else result.table())
 
 
+def _check_outputs(options: argparse.Namespace) -> None:
+    if "flights" in options:
+        _check_file("flights", options.flights)
+    if "out" in options and os.path.exists(options.out) and not os.path.isdir(options.out):
+        raise BadInput(f"out: {options.out} is a file. Give a directory.")
+
+
 def _check_file(option: str, path: Path) -> None:
     """Refuse a file that cannot be written, before anything is flown."""
     if not os.path.isdir(path.parent):
@@ -239,12 +345,11 @@ def _check_file(option: str, path: Path) -> None:
         raise BadInput(f"{option}: {path} is a directory. Give a file.")
 
 
-def _write_evaluation(folder: Path, judgement: dict[str, Any]) -> None:
-    path = folder / "evaluation.json"
+def _write_json(path: Path, content: dict[str, Any]) -> None:
     try:
-        folder.mkdir(parents=True, exist_ok=True)
+        path.parent.mkdir(parents=True, exist_ok=True)
         whole = path.with_name(path.name + ".part")
-        whole.write_text(json.dumps(judgement, indent=2) + "\n", encoding="utf-8")
+        whole.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
         whole.replace(path)
     except OSError as error:
         raise BadInput(f"out: {path} cannot be written ({error.strerror}). Give another directory.") from None

@@ -6,43 +6,65 @@ import os
 from pathlib import Path
 from typing import Any
 
+from flytune.control.classical import CLASSICAL, classical_pilot
 from flytune.control.controller import Controller
 from flytune.control.policy import load_policy
 from flytune.errors import BadInput
+from flytune.export.onnx_pilot import load_onnx
+from flytune.export.sb3_model import load_sb3
 from flytune.learn.directory import read_facts, resume_command
 from flytune.task.task import Task, load_task, read_task_text
+
+READERS = {".safetensors": load_policy, ".onnx": load_onnx, ".zip": load_sb3}
+KINDS = f"a run directory, a policy file ({', '.join(READERS)}), or {', '.join(CLASSICAL)}"
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Pilot:
-    """A controller, what it was made for, and how it was made."""
+    """A controller, the task it flies, and how it was made."""
 
     name: str
     controller: Controller
-    task: Task | None  # what it was trained for, where that is known
+    task: Task  # the one asked for, else the one it was trained for, else the baseline
     metrics: list[dict[str, Any]] | None  # its training, one row per update
     about: dict[str, str]  # facts for a reader
 
 
-def find_pilot(who: str) -> Pilot:
-    """The pilot that a run directory or a policy file holds.
+def find_pilot(who: str, task: str | Task | None = None) -> Pilot:
+    """The pilot that a run directory, a policy file or the name of a classical controller stands for.
+
+    Args:
+        who: `runs/baseline-apg-s0`, `policy.safetensors`, `policy.onnx`, a Stable-Baselines3 model `model.zip`,
+            `pid`, `geometric` or `lqr` (gains tuned by search; `pid@textbook` for those of the books).
+        task: what it is to fly; its own, or the baseline, where None.
 
     Raises:
         BadInput: there is no such thing, or it cannot be used.
     """
+    wanted = load_task(task) if isinstance(task, str) else task
     path = Path(who)
     if os.path.isdir(who):  # unlike Path.is_dir, also where the name is too long to be one
-        return _from_run(who, path)
-    if path.suffix == ".safetensors" or os.path.isfile(who):
-        policy = load_policy(path)
-        about = {key: str(value) for key, value in policy.about.items() if key != "task_toml"}
-        return Pilot(name=who, controller=policy, task=_task_of(who, policy.about), metrics=None, about=about)
-    raise BadInput(
-        f"{who}: no such pilot. Allowed: a run directory (as `flytune train` prints it), or a .safetensors policy."
-    )
+        return _from_run(who, path, wanted)
+    if path.suffix in READERS or os.path.isfile(who):
+        return _from_file(who, path, wanted)
+    name, at, gains = who.partition("@")
+    if name in CLASSICAL:
+        flown = wanted or load_task("baseline")
+        controller = classical_pilot(name, flown, gains if at else "tuned")  # pyright: ignore[reportArgumentType]  (it checks the name)
+        about = {"controller": name, "gains": gains or "tuned"}
+        return Pilot(name=who, controller=controller, task=flown, metrics=None, about=about)
+    raise BadInput(f"{who}: no such pilot. Allowed: {KINDS}.")
 
 
-def _from_run(who: str, path: Path) -> Pilot:
+def _from_file(who: str, path: Path, wanted: Task | None) -> Pilot:
+    policy = READERS.get(path.suffix, load_policy)(path)
+    about = {key: str(value) for key, value in policy.about.items() if key != "task_toml"}
+    text = policy.about.get("task_toml")
+    task = wanted or (read_task_text(text, who) if text else load_task("baseline"))
+    return Pilot(name=who, controller=policy, task=task, metrics=None, about=about)
+
+
+def _from_run(who: str, path: Path, wanted: Task | None) -> Pilot:
     facts = read_facts(path)
     if not (path / "policy.safetensors").exists():
         begun = (path / "checkpoint" / "learner.safetensors").exists()
@@ -59,7 +81,8 @@ def _from_run(who: str, path: Path) -> Pilot:
         "started": facts["time"],
     }
     metrics = _read_metrics(path / "metrics.jsonl")
-    return Pilot(name=who, controller=policy, task=load_task(path / "task.toml"), metrics=metrics, about=about)
+    task = wanted or load_task(path / "task.toml")
+    return Pilot(name=who, controller=policy, task=task, metrics=metrics, about=about)
 
 
 def _read_metrics(path: Path) -> list[dict[str, Any]] | None:
@@ -72,15 +95,3 @@ def _read_metrics(path: Path) -> list[dict[str, Any]] | None:
     except (OSError, ValueError) as error:
         raise BadInput(f"{path}: is damaged ({error}). Remove it to go without the learning curve.") from None
     return rows
-
-
-def _task_of(who: str, about: dict[str, Any]) -> Task | None:
-    text = about.get("task_toml")
-    return read_task_text(text, who) if text else None
-
-
-def task_for(pilot: Pilot, task: str | None) -> Task:
-    """The task a pilot is to fly: the one asked for, else its own, else the baseline."""
-    if task is not None:
-        return load_task(task)
-    return pilot.task or load_task("baseline")

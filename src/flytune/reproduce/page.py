@@ -139,7 +139,7 @@ scale: inspection's terms add up to less.""",
 Trials that settle; under each box how many these are. A low box over a small number is no success.""",
     "overshoot": "Raw: also excursions that stay inside the settling band. Small steps have none.",
     "error": "Distance of the mean of the last two seconds from the target, on each axis.",
-    "profile": "The first five tests of the first seed, the same starts and noise for each behaviour; green is the band.",
+    "profile": "The first five tests of the first seed, the same starts and noise for each; green is the band.",
     "motors": """
 Left, what the paper draws: every controller that hovers has the hover speed in the mean (C6). Right, what tells them
 apart.""",
