@@ -88,15 +88,15 @@ def test_the_camera_keeps_both_in_the_picture_and_level_above_the_ground():
 
 
 def test_the_front_is_red_and_points_where_the_vehicle_does(scene):
-    front = [0.03, 0, 0]
-    ahead = dataclasses.replace(scene, position=scene.target + np.array([0.5, 0, 0]))
-    behind = dataclasses.replace(ahead, attitude=np.array([0.0, 0.0, 1.0, 0.0]))  # turned half round
-    for seen, sign in ((ahead, 1), (behind, -1)):
+    there = dataclasses.replace(scene, position=scene.target + np.array([0.5, 0, 0]))
+    for quarters, front in enumerate(([1, 0, 0], [0, 1, 0], [-1, 0, 0], [0, -1, 0])):
+        half = quarters * math.pi / 4
+        seen = dataclasses.replace(there, attitude=np.array([0.0, 0.0, math.sin(half), math.cos(half)]))
         image = draw(seen)
         middle = pixel(seen, seen.position)
         spots = like(image, picture.FRONT, 90)[:, ::-1]
         near = spots[np.linalg.norm(spots - middle, axis=1) < 60]
-        wanted = pixel(seen, seen.position + sign * np.array(front)) - middle
+        wanted = pixel(seen, seen.position + 0.03 * np.array(front)) - middle
         assert len(near) > 10
         assert (near.mean(axis=0) - middle) @ wanted > 0
 
