@@ -37,6 +37,7 @@ thead tr:first-child th:first-child { text-align: left; padding-left: 0; }
 thead tr + tr th { font-weight: 400; color: #52606d; text-align: right; }
 tbody th, tbody td { padding: 5px 10px; border-bottom: 1px solid #e4e7eb; text-align: right; white-space: nowrap; }
 tbody th { text-align: left; padding-left: 0; font-weight: 600; }
+.words th, .words td { white-space: normal; text-align: left; vertical-align: top; padding-left: 0; }
 table.dense { font-size: 0.87rem; }
 table.dense th, table.dense td { padding-left: 5px; padding-right: 5px; }
 table.dense tbody th { white-space: normal; overflow-wrap: anywhere; min-width: 9rem; padding-left: 0; }
