@@ -81,5 +81,5 @@ class MujocoWorld:
         )
 
     def close(self) -> None:
-        """Let go of the model; MuJoCo frees it with its last user."""
-        del self._model, self._data
+        """Let go of the model; a second call does nothing."""
+        self._model = self._data = None
