@@ -190,7 +190,8 @@ def _train(options: argparse.Namespace) -> None:
         raise BadInput("resume: needs --out DIR, the run to go on with.")
     out = options.out if "out" in options else new_directory(task, options.trainer, options.seed)
     with show_progress() as on_progress:
-        run = train(task, options.trainer, seed=options.seed, out=out, resume=options.resume, on_progress=on_progress)
+        run = train(task, options.trainer, seed=options.seed, out=out, resume=options.resume,
+                    tensorboard=options.tensorboard, on_progress=on_progress)  # fmt: skip
     judgement = judge(fly(run.policy, task, who=str(out)))
     _write_json(out / "evaluation.json", judgement.to_dict())
     print(judgement.line())

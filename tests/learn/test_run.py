@@ -138,3 +138,18 @@ def test_an_update_gives_back_a_learner_of_the_types_it_took_so_that_it_compiles
         [(leaf.shape, leaf.dtype, leaf.weak_type) for leaf in jax.tree.leaves(learner)] for learner in (before, after)
     ]
     assert kinds[0] == kinds[1]
+
+
+def test_a_training_writes_what_tensorboard_reads(tmp_path, small_task):
+    accumulator = pytest.importorskip(
+        "tensorboard.backend.event_processing.event_accumulator", reason="needs flytune[tensorboard]"
+    )
+    run = train(small_task, "apg", out=tmp_path / "run", tensorboard=True)
+    seen = accumulator.EventAccumulator(str(tmp_path / "run")).Reload().Scalars("reward")
+    assert [event.step for event in seen] == [row["steps"] for row in run.metrics]
+    assert [event.value for event in seen] == pytest.approx([row["reward"] for row in run.metrics])
+
+
+def test_tensorboard_without_a_directory_is_refused(small_task):
+    with pytest.raises(BadInput, match="run directory"):
+        train(small_task, "apg", tensorboard=True)

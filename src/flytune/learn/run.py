@@ -19,6 +19,7 @@ from flytune.control.policy import Policy
 from flytune.errors import BadInput, Diverged, Interrupted
 from flytune.learn import apg, ppo, sb3
 from flytune.learn.directory import RunDirectory, resume_command
+from flytune.learn.tensorboard import EventLog, check_tensorboard
 from flytune.task.task import Task, write_task
 from flytune.task.termination import causes
 
@@ -59,6 +60,7 @@ def train(
     seed: int = 0,
     out: Path | None = None,
     resume: bool = False,
+    tensorboard: bool = False,
     on_progress: Callable[[Progress], None] | None = None,
 ) -> Run:
     """A policy trained for a task, and the way there.
@@ -73,6 +75,7 @@ def train(
         seed: of the weights, the episodes and the noise; 0 or more.
         out: run directory to write; nothing is written where None.
         resume: go on from the checkpoint in `out`.
+        tensorboard: write TensorBoard's event files beside the metrics in `out`.
         on_progress: called after every update.
 
     Raises:
@@ -86,6 +89,10 @@ def train(
         raise BadInput(f"seed: {seed} is not allowed. Allowed: a whole number, 0 to {2**32 - 1}.")
     if trainer == "sb3":
         sb3.check_installed()
+    if tensorboard:
+        check_tensorboard()
+        if out is None:
+            raise BadInput("tensorboard: needs out, the run directory to write its event files into.")
     settings = task.apg if trainer == "apg" else task.ppo
     teacher = TRAINERS[trainer]
     rows: list[dict[str, Any]] = []
@@ -95,7 +102,15 @@ def train(
         if directory is not None and resume:
             learner, rows = directory.resume(learner)
         clock = _Clock(task, trainer, seed, rows)
-        learner = _loop(teacher, task, settings, learner, rows, clock, directory, interrupted, on_progress)
+        with EventLog(out, rows) if tensorboard and out is not None else contextlib.nullcontext() as log:
+
+            def tell(number: int, row: dict[str, Any]) -> None:
+                if log is not None:
+                    log.write(row)
+                if on_progress is not None:
+                    on_progress(clock.progress(number, row["reward"]))
+
+            learner = _loop(teacher, task, settings, learner, rows, clock, directory, interrupted, tell)
     about = _about(task, trainer, seed, rows)
     run = Run(
         task=task,
@@ -180,9 +195,9 @@ def _loop(
     clock: _Clock,
     directory: RunDirectory | None,
     interrupted: threading.Event,
-    on_progress: Callable[[Progress], None] | None,
+    tell: Callable[[int, dict[str, Any]], None],
 ) -> Any:
-    """The learner after all updates; `rows` grows by one per update."""
+    """The learner after all updates; `rows` grows by one per update, and `tell` hears of each."""
     names, saved = causes(task.termination), time.monotonic()
     for number in range(len(rows) + 1, clock.updates + 1):
         learner, seen = teacher.update(task, settings, learner)
@@ -190,8 +205,7 @@ def _loop(
         row = _row(seen, names, number, number * clock.samples, clock.seconds(number))
         _check_finite(row)
         rows.append(row)
-        if on_progress is not None:
-            on_progress(clock.progress(number, row["reward"]))
+        tell(number, row)
         if directory is not None and (interrupted.is_set() or time.monotonic() - saved > CHECKPOINT_INTERVAL):
             directory.checkpoint(learner, rows)
             saved = time.monotonic()
