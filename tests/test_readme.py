@@ -4,6 +4,7 @@ import re
 import shlex
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 
 import pytest
@@ -39,11 +40,16 @@ def test_every_file_the_readme_links_to_is_there():
 
 
 def test_the_names_the_readme_lists_are_the_ones_that_ship():
+    from flytune.control.classical import CLASSICAL
+    from flytune.learn.run import TRAINERS
     from flytune.physics.vehicle import vehicle_names
     from flytune.task.task import preset_names
 
-    listed = set(re.findall(r"^\| `([\w-]+)`", README, flags=re.MULTILINE))
-    assert set(preset_names()) | set(vehicle_names()) | {"apg", "ppo"} == listed
+    extras = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]["optional-dependencies"]
+    first_cells = re.findall(r"^\| (`[^|]+`)", README, flags=re.MULTILINE)
+    listed = {name for cell in first_cells for name in re.findall(r"`([\w-]+)`", cell)}
+    ours = {*preset_names(), *vehicle_names(), *TRAINERS, *CLASSICAL, *extras} - {"build", "dev"}
+    assert ours == listed
 
 
 @pytest.mark.slow
