@@ -12,12 +12,14 @@ import jax.numpy as jnp
 
 from flytune import env
 from flytune.learn import apg, ppo
+from flytune.learn.incumbent import Row, compare_simulation, compare_training
 from flytune.learn.run import steps_per_update
 from flytune.task.observation import NOISY
 from flytune.task.task import Task, load_task
 from flytune.task.training import PpoSettings
 
 BATCH, WIDTH = 128, 64  # of the matrix product everything is compared with: 128 x 64 times 64 x 64, float32
+SIMULATED = 1024, 200  # environments and steps of a compiled simulation
 REPEATS = 5  # the fastest counts: other work on the machine only ever slows a run down
 
 
@@ -30,6 +32,8 @@ class Throughput:
     ppo_share_of_limit: float | None  # of what the matrix product alone would allow
     apg: float | None
     simulate: float | None
+    training: list[Row] | None  # beside Stable-Baselines3 and PyBullet
+    simulation: list[Row] | None
     device: str
     cores: int | None
 
@@ -52,11 +56,15 @@ class Throughput:
             lines.append(f"train apg (forward and backward)           {self.apg:10,.0f} steps/s")
         if self.simulate is not None:
             lines.append(f"simulate (observe, step, reward, reset)    {self.simulate:10,.0f} steps/s")
+        for title, rows in (("training", self.training), ("simulation", self.simulation)):
+            if rows is not None:
+                heading = f"{title} (environments x steps, processes that simulate; ratio to the first row)"
+                lines += ["", heading, *(f"  {row.line()}" for row in rows)]
         return "\n".join(lines)
 
 
 def bench(what: str = "all") -> Throughput:
-    """Throughput of training and of simulation, beside that of a plain matrix product timed in the same run.
+    """Throughput of training and of simulation, beside a plain matrix product and what else is installed.
 
     Args:
         what: `train`, `simulate` or `all`.
@@ -66,12 +74,15 @@ def bench(what: str = "all") -> Throughput:
     product = _matrix_product()
     ppo_rate = _training(ppo, task, task.ppo, steps_per_update(task, "ppo")) if training else None
     product = max(product, _matrix_product())  # the limit is what the machine can do undisturbed
+    simulate_rate = _simulation(task) if simulation else None
     return Throughput(
         matrix_product=product,
         ppo=ppo_rate,
         ppo_share_of_limit=ppo_rate * operations_per_step(task.ppo) / product if ppo_rate else None,
         apg=_training(apg, task, task.apg, steps_per_update(task, "apg")) if training else None,
-        simulate=_simulation(task) if simulation else None,
+        simulate=simulate_rate,
+        training=compare_training(task, ppo_rate) if ppo_rate else None,
+        simulation=compare_simulation(task, simulate_rate, SIMULATED) if simulate_rate else None,
         device=jax.devices()[0].platform,
         cores=os.cpu_count(),
     )
@@ -122,7 +133,8 @@ def _training(teacher: Any, task: Task, settings: Any, samples: int) -> float:
     return samples / _fastest(one)
 
 
-def _simulation(task: Task, environments: int = 1024, steps: int = 200) -> float:
+def _simulation(task: Task) -> float:
+    environments, steps = SIMULATED
     keys = jax.random.split(jax.random.key(0), environments)
     episodes = jax.vmap(lambda key: env.reset(task, key), out_axes=-1)(keys)
 

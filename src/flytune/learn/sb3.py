@@ -104,39 +104,44 @@ def update(task: Task, settings: PpoSettings, learner: Learner) -> tuple[Learner
     return Learner(workbench=learner.workbench, average=average, updates=learner.updates + 1, **taken), seen
 
 
+def make_model(settings: PpoSettings, environments: Any, seed: int) -> Any:
+    """Stable-Baselines3's PPO with our settings, on a vector environment of its kind."""
+    from stable_baselines3 import PPO
+    from torch.nn import Tanh
+
+    hidden = list(settings.hidden)
+    return PPO(
+        "MlpPolicy",
+        environments,
+        n_steps=settings.rollout,
+        n_epochs=settings.epochs,
+        batch_size=settings.minibatch,
+        learning_rate=float(settings.learning_rate),
+        clip_range=float(settings.clip),
+        gamma=float(settings.discount),
+        gae_lambda=float(settings.gae_lambda),
+        vf_coef=float(settings.value_weight),
+        ent_coef=float(settings.entropy_weight),
+        max_grad_norm=float(settings.gradient_norm),
+        policy_kwargs={
+            "net_arch": {"pi": hidden, "vf": hidden},
+            "activation_fn": Tanh,
+            "log_std_init": float(settings.initial_log_std),
+        },
+        seed=seed,
+        device="cpu",
+    )
+
+
 class _Workbench:
     """Stable-Baselines3's model of a training, and the environments it learns in."""
 
     def __init__(self, task: Task, settings: PpoSettings, seed: int) -> None:
-        from stable_baselines3 import PPO
-        from torch.nn import Tanh
-
         from flytune.bridges.sb3 import HoverVecEnv
 
         self.task, self.settings = task, settings
         self.environments = HoverVecEnv(task, settings.environments, seed)
-        hidden = list(settings.hidden)
-        self.model = PPO(
-            "MlpPolicy",
-            self.environments,
-            n_steps=settings.rollout,
-            n_epochs=settings.epochs,
-            batch_size=settings.minibatch,
-            learning_rate=float(settings.learning_rate),
-            clip_range=float(settings.clip),
-            gamma=float(settings.discount),
-            gae_lambda=float(settings.gae_lambda),
-            vf_coef=float(settings.value_weight),
-            ent_coef=float(settings.entropy_weight),
-            max_grad_norm=float(settings.gradient_norm),
-            policy_kwargs={
-                "net_arch": {"pi": hidden, "vf": hidden},
-                "activation_fn": Tanh,
-                "log_std_init": float(settings.initial_log_std),
-            },
-            seed=seed,
-            device="cpu",
-        )
+        self.model = make_model(settings, self.environments, seed)
         self.ended = np.ones(settings.environments, bool)
 
     def put(self, learner: Learner) -> None:
