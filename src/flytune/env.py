@@ -57,7 +57,11 @@ def step(task: Task, episode: Episode, action: Float[Array, "4"]) -> tuple[Episo
     The action is clipped to [-1, 1]; the clipped action is flown, penalised and later observed (paper R9).
     """
     action = jnp.clip(action, -1.0, 1.0)
-    state = dynamics.step(task.vehicle, episode.state, action)
+    return judge(task, episode, dynamics.step(task.vehicle, episode.state, action), action)
+
+
+def judge(task: Task, episode: Episode, state: State, action: Float[Array, "4"]) -> tuple[Episode, Outcome]:
+    """The episode in the state that a clipped action led to, and what that is worth; whose physics did it is open."""
     here = situation(task.target, state, action - episode.last_action)
     terms = rewards(task.reward, here)
     left = margins(task.termination, here)

@@ -21,10 +21,7 @@ from flytune.physics import dynamics, rotation
 from flytune.physics.components import pack, unpack
 from flytune.physics.dynamics import State
 from flytune.task.observation import SIZE
-from flytune.task.reward import rewards
-from flytune.task.situation import situation
 from flytune.task.task import Task
-from flytune.task.termination import SAFE, cause, margins
 
 PARTS = {"position": 3, "attitude": 4, "velocity": 3, "body_rate": 3, "rotor_speed_rpm": 4}  # of a Body
 BODY = sum(PARTS.values())
@@ -136,20 +133,8 @@ def _judge(
     cuts = np.cumsum(list(PARTS.values()))[:-1]
     moved = {name: unpack(part) for name, part in zip(PARTS, jnp.split(body, cuts), strict=True)}
     state = State(**moved, pending_actions=before.state.pending_actions)  # the world keeps its own
-    after, outcome = _judged(task, before, state, jnp.clip(action, -1.0, 1.0))
+    after, outcome = env.judge(task, before, state, jnp.clip(action, -1.0, 1.0))
     return _report(task, after, normal, outcome)
-
-
-def _judged(task: Task, before: Episode, state: State, action: jax.Array) -> tuple[Episode, Outcome]:
-    """What `env.step` says of an action that led to `state`, whoever's physics did."""
-    here = situation(task.target, state, action - before.last_action)
-    terms, left = rewards(task.reward, here), margins(task.termination, here)
-    reward, why, steps = sum(terms.values(), start=jnp.zeros(())), cause(left), before.steps + 1
-    terminated = why != SAFE
-    truncated = (steps >= task.horizon) & ~terminated
-    after = Episode(state=state, last_action=action, steps=steps, reward=before.reward + reward)
-    outcome = Outcome(reward=reward, terms=terms, margins=left, cause=why, terminated=terminated, truncated=truncated)
-    return after, outcome
 
 
 def _unravel(task: Task) -> Any:
