@@ -75,7 +75,7 @@ def _words(comparison: Comparison) -> str:
     for name in comparison.names:
         found = sentences([one for one in comparison.differences if one.who == name], against)
         if found:
-            first, *more = (escape(text) for text in found)
+            first, *more = (escape(text).replace(" %", "&nbsp;%") for text in found)
             items = "".join(f"<li>{text}</li>" for text in more)
             state = " open" if len(comparison.names) == 2 else ""
             paragraphs.append(f"<details{state}><summary>{first}</summary><ul>{items}</ul></details>")
@@ -93,7 +93,7 @@ as infinite, and {tables.DASH} says that the quantile falls among those. Crossed
 pilot's task.</p>""",
     "paired": """
 the dot is the median, the bar its 95&nbsp;% bootstrap interval over
-trials. On the dashed line there is no difference; left of it the pilot has less, which is better for times, overshoot
+trials. On the dark line there is no difference; left of it the pilot has less, which is better for times, overshoot
 and errors, and neither good nor bad for speed and action. A triangle at the edge is an infinite median: in most trials
 one of the two fails and the other does not. An interval tells about these pilots, not about others trained or tuned
 the same way; and of twenty such intervals one misses by chance.""",

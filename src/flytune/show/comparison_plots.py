@@ -76,7 +76,12 @@ def responses(flights: Sequence[Flights], comparison: Comparison) -> go.Figure:
         low, high = _reach(errors, band)
         place: dict[str, Any] = {"row": row, "col": 2}
         figure.add_hrect(low / 2, band, fillcolor=style.BAND, line_width=0, layer="below", **place)
-        decades: dict[str, Any] = {"type": "log", "dtick": 1, "range": [math.log10(low), math.log10(high)]}
+        decades: dict[str, Any] = {
+            "type": "log",
+            "dtick": 1,
+            "exponentformat": "none",
+            "range": [math.log10(low), math.log10(high)],
+        }
         figure.update_yaxes(title_text=f"|{channel} error| [{unit}]", **decades, **place)
         title_text = f"{'distance' if channel == 'position' else channel} [{unit}]"
         figure.update_yaxes(title_text=title_text, row=row, col=1)
@@ -201,6 +206,7 @@ def paired(comparison: Comparison) -> go.Figure:
     figure.update_xaxes(nticks=5, tickfont_size=11, exponentformat="none")
     figure = _finish(figure, comparison.names, others, height)
     figure.update_yaxes(showgrid=False)
+    figure.update_xaxes(zeroline=True, zerolinecolor=style.INK, zerolinewidth=1.2)
     return figure.update_xaxes(title_font_size=11.5, title_font_color=style.QUIET)
 
 
@@ -236,7 +242,6 @@ def _draw_differences(
             meta=pilot,
         )
         figure.add_traces([bar, dot], rows=row, cols=column)
-    figure.add_vline(0, line={"color": style.QUIET, "width": 1, "dash": "dash"}, layer="below", **place)
     figure.update_xaxes(range=[left, right], **place)
 
 

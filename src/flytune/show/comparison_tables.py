@@ -59,8 +59,8 @@ def paired_table(comparison: Comparison) -> str:
         symbol, scale = unit(metric)
         found = [one for one in comparison.differences if one.metric is metric]
         cells = (
-            f"<strong>{_signed(one.median * scale)}</strong>"
-            f"<br>{_signed(one.low * scale)} to {_signed(one.high * scale)}"
+            f"<strong>{signed(one.median * scale)}</strong>"
+            f"<br>{signed(one.low * scale)} to {signed(one.high * scale)}"
             f"<br>{one.better} : {one.worse}" + f" ({one.left_out} left out)" * (one.left_out > 0)
             for one in found
         )
@@ -79,7 +79,7 @@ def pilot(index: int, name: str) -> str:
     return f'<span style="{badge}">{index + 1}</span>{escape(name)}'
 
 
-def _signed(value: float) -> str:
+def signed(value: float) -> str:
     """A difference with its sign, to three digits."""
     if math.isnan(value):
         return DASH

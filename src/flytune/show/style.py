@@ -46,7 +46,7 @@ def frame(figure: go.Figure, height: int, **layout: Any) -> go.Figure:
 
 def room_for_names(number: int) -> int:
     """Pixels above the panels for the buttons, a legend of so many names that may all be long, and the titles."""
-    return 76 + 20 * ((number - 1) // 2)
+    return 84 + 20 * ((number - 1) // 2)
 
 
 def legend_below_tools(figure: go.Figure) -> go.Figure:
