@@ -13,10 +13,11 @@ from flytune.errors import BadInput
 from flytune.export.onnx_pilot import load_onnx
 from flytune.export.sb3_model import load_sb3
 from flytune.learn.directory import read_facts, resume_command
+from flytune.learn.shipped import shipped_files, shipped_names
 from flytune.task.task import Task, load_task, read_task_text
 
 READERS = {".safetensors": load_policy, ".onnx": load_onnx, ".zip": load_sb3}
-KINDS = f"a run directory, a policy file ({', '.join(READERS)}), or {', '.join(CLASSICAL)}"
+KINDS = f"a run directory, a policy file ({', '.join(READERS)}), {', '.join(CLASSICAL)}"
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -53,7 +54,9 @@ def find_pilot(who: str, task: str | Task | None = None) -> Pilot:
         controller = classical_pilot(name, flown, gains if at else "tuned")  # pyright: ignore[reportArgumentType]  (it checks the name)
         about = {"controller": name, "gains": gains or "tuned"}
         return Pilot(name=who, controller=controller, task=flown, metrics=None, about=about)
-    raise BadInput(f"{who}: no such pilot. Allowed: {KINDS}.")
+    if who in shipped_names():
+        return _shipped(who, wanted)
+    raise BadInput(f"{who}: no such pilot. Allowed: {KINDS}{''.join(f', {name}' for name in shipped_names())}.")
 
 
 def _from_file(who: str, path: Path, wanted: Task | None) -> Pilot:
@@ -62,6 +65,13 @@ def _from_file(who: str, path: Path, wanted: Task | None) -> Pilot:
     text = policy.about.get("task_toml")
     task = wanted or (read_task_text(text, who) if text else load_task("baseline"))
     return Pilot(name=who, controller=policy, task=task, metrics=None, about=about)
+
+
+def _shipped(who: str, wanted: Task | None) -> Pilot:
+    path, record = shipped_files(who)
+    facts = json.loads(record.read_text(encoding="utf-8"))
+    pilot = _from_file(who, path, wanted)
+    return dataclasses.replace(pilot, about=pilot.about | {"trained": facts["time"], "commit": str(facts["commit"])})
 
 
 def _from_run(who: str, path: Path, wanted: Task | None) -> Pilot:

@@ -1,0 +1,58 @@
+"""Put the best policy of each behaviour of finished studies into the package, with the run.json that proves it.
+
+    flytune reproduce --refined --trainer apg --out refined-apg
+    flytune reproduce --refined --trainer ppo --out refined-ppo
+    python benchmarks/ship_policies.py refined-apg refined-ppo
+
+Best is the seed with most feasible trials settled on all axes, and of these the one with the smallest median error of
+position; what counts is the policy that is flown by default, on trials that neither training nor `evaluate` uses.
+"""
+
+import json
+import shutil
+import sys
+from pathlib import Path
+
+import numpy as np
+
+from flytune.control.policy import load_policy
+from flytune.learn.directory import read_facts
+from flytune.learn.shipped import HOME
+from flytune.reproduce.study import ROLES, Study
+from flytune.response.fly import fly
+from flytune.response.judge import AXES, judge
+
+SEED = 1000  # of starts and noise; evaluations use 1
+
+
+def quality(directory: Path, study: Study, role: str) -> tuple[int, float]:
+    """More is better: feasible trials settled on all axes, and the median error with its sign turned."""
+    judgement = judge(fly(load_policy(directory / "policy.safetensors"), study.task(role), trials=200, seed=SEED))
+    settled = np.all([np.isfinite(judgement.settling_time[axis]) for axis in AXES], axis=0)
+    return int(np.sum(settled & ~judgement.infeasible)), -float(np.median(judgement.steady_state_error["position"]))
+
+
+def ship(folder: Path) -> None:
+    """Copy the best policies of one study."""
+    plan = json.loads((folder / "reproduction.json").read_text(encoding="utf-8"))
+    runs = [
+        path for path in (folder / "runs").iterdir() if not path.name.startswith(".") and "damaged" not in path.name
+    ]
+    study = Study(folder=folder, trainer=plan["trainer"], steps=plan["steps"], refined=plan["refined"],
+                  seeds=len(runs) // len(ROLES))  # fmt: skip
+    for role in ROLES:
+        members = [member for member in study.members() if member.role == role]
+        ranked = sorted(members, key=lambda member: quality(member.directory, study, role), reverse=True)
+        best = ranked[0]
+        stem = f"{best.preset}@{study.trainer}"
+        target = Path(str(HOME))
+        target.mkdir(exist_ok=True)
+        shutil.copyfile(best.directory / "policy.safetensors", target / f"{stem}.safetensors")
+        facts = read_facts(best.directory)
+        (target / f"{stem}.json").write_text(json.dumps(facts, indent=2) + "\n", encoding="utf-8")
+        print(f"{stem}: seed {best.seed}, {quality(best.directory, study, role)}")
+
+
+if __name__ == "__main__":
+    for name in sys.argv[1:]:
+        ship(Path(name))
