@@ -34,12 +34,8 @@ def quality(directory: Path, study: Study, role: str) -> tuple[int, float]:
 
 def ship(folder: Path) -> None:
     """Copy the best policies of one study."""
-    plan = json.loads((folder / "reproduction.json").read_text(encoding="utf-8"))
-    runs = [
-        path for path in (folder / "runs").iterdir() if not path.name.startswith(".") and "damaged" not in path.name
-    ]
-    study = Study(folder=folder, trainer=plan["trainer"], steps=plan["steps"], refined=plan["refined"],
-                  seeds=len(runs) // len(ROLES))  # fmt: skip
+    told = json.loads((folder / "verdicts.json").read_text(encoding="utf-8"))
+    study = Study(folder=folder, **{name: told[name] for name in ("trainer", "steps", "refined", "seeds")})
     for role in ROLES:
         members = [member for member in study.members() if member.role == role]
         ranked = sorted(members, key=lambda member: quality(member.directory, study, role), reverse=True)

@@ -8,11 +8,10 @@ HOME = resources.files("flytune") / "policies"
 
 
 def shipped_names() -> list[str]:
-    """What WHO may be without a training: `TASK` for the policy of the analytic gradient, `TASK@TRAINER` for another."""
-    files = (
-        sorted(entry.name for entry in HOME.iterdir() if entry.name.endswith(".safetensors")) if HOME.is_dir() else []
-    )
-    return [name.removesuffix(".safetensors").removesuffix(f"@{DEFAULT_TRAINER}") for name in files]
+    """Who flies without a training: `TASK` for the policy of the analytic gradient, `TASK@TRAINER` for another."""
+    entries = sorted(entry.name for entry in HOME.iterdir()) if HOME.is_dir() else []
+    stems = [name.removesuffix(".safetensors") for name in entries if name.endswith(".safetensors")]
+    return [stem.removesuffix(f"@{DEFAULT_TRAINER}") for stem in stems]
 
 
 def shipped_files(name: str) -> tuple[Path, Path]:
