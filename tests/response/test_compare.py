@@ -274,6 +274,13 @@ def test_the_table_says_the_difference_in_plain_words(make_judgement):
     assert "apg settles 0.42 s earlier than pid (95 % interval 0.42 to 0.42), earlier in 17 of 20 trials, " in back
 
 
+def test_an_interval_below_zero_is_told_from_its_smaller_to_its_larger_end(make_judgement):
+    # differences -9 to -1: the median is -5, the ends are the 2nd and the 8th, -8 and -2
+    pilots = [make_judgement("apg", settling=np.full(9, 10.0)), make_judgement("pid", settling=10 - np.arange(1.0, 10))]
+    told = str(compare(pilots))
+    assert "pid settles 5.00 s earlier than apg (95 % interval 2.00 to 8.00), earlier in 9 of 9 trials" in told
+
+
 def test_an_interval_that_holds_zero_says_both_ways(make_judgement):
     # differences -4 to 4 in nine trials but for 0: the median is 0.5, the ends are the 2nd and the 8th
     late = np.array([-4, -3, -2, -1, 0.5, 1, 2, 3, 4])
