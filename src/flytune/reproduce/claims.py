@@ -5,7 +5,7 @@ them and carry no verdict.
 """
 
 import tomllib
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from importlib import resources
 from typing import Any
 
@@ -32,12 +32,13 @@ MEASURES: dict[str, Callable[[Evidence, Flown], Measured]] = {
 OF_TRAINING = {"R27-variance", "R27-survival", "R28"}  # nothing is flown, so there is no row for averaged weights
 
 
-def claims(evidence: Evidence) -> list[Verdict]:
-    """The verdicts, in the order of the paper's items."""
+def claims(evidence: Evidence, items: Collection[str] | None = None) -> list[Verdict]:
+    """The verdicts, in the order of the paper's items; all of them where `items` is None."""
     words = tomllib.loads((resources.files("flytune.reproduce") / "claims.toml").read_text(encoding="utf-8"))
     return [
         _heuristic(evidence, item, text) if "knobs" in text else _claim(evidence, item, text)
         for item, text in words.items()
+        if items is None or item in items
     ]
 
 

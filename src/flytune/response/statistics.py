@@ -4,7 +4,7 @@ Conventions for per-trial values: +inf is a trial that failed (did not settle, o
 NaN is a trial to which the metric does not apply (the overshoot of a small step) and is left out.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
 from jaxtyping import Float
@@ -81,9 +81,28 @@ def bootstrap_interval(
     if not 0 < level < 1:
         raise BadInput(f"level: {level} is not in (0, 1); use 0.95 for a 95 % interval")
     generator = np.random.default_rng(seed)
-    draws = np.empty(number)
-    for index in range(number):
-        drawn = [groups[group] for group in generator.integers(len(groups), size=len(groups))]
-        estimate = statistic(np.concatenate([generator.choice(trials, size=trials.size) for trials in drawn]))
-        draws[index] = np.inf if estimate is None else estimate
+    drawn = _draw_alike(groups, number, generator) if _alike(groups, number) else _draw(groups, number, generator)
+    estimates = (statistic(trials) for trials in drawn)
+    draws = np.array([np.inf if estimate is None else estimate for estimate in estimates])
     return quantile(draws, (1 - level) / 2), quantile(draws, (1 + level) / 2)
+
+
+def _alike(groups: Sequence[np.ndarray], number: int) -> bool:
+    """Whether all draws can be made at once: seeds of as many trials, and few enough numbers to hold."""
+    sizes = {trials.size for trials in groups}
+    return len(sizes) == 1 and number * sum(trials.size for trials in groups) <= 20_000_000
+
+
+def _draw_alike(groups: Sequence[np.ndarray], number: int, generator: np.random.Generator) -> np.ndarray:
+    """All draws [number, seeds * trials] at once."""
+    table = np.stack(groups)
+    seeds, trials = table.shape
+    chosen = generator.integers(seeds, size=(number, seeds, 1))
+    return table[chosen, generator.integers(trials, size=(number, seeds, trials))].reshape(number, -1)
+
+
+def _draw(groups: Sequence[np.ndarray], number: int, generator: np.random.Generator) -> Iterator[np.ndarray]:
+    """One draw after the other."""
+    for _ in range(number):
+        drawn = [groups[group] for group in generator.integers(len(groups), size=len(groups))]
+        yield np.concatenate([generator.choice(trials, size=trials.size) for trials in drawn])
