@@ -3,8 +3,8 @@
     python benchmarks/tune_classical.py pid geometric lqr
     python benchmarks/tune_classical.py pid --trials 400 --write
 
-Each trial flies one set of gains on the baseline task from the same 64 `clear` starts with the same noise, of a seed that
-no evaluation uses. The cost is in seconds:
+Each trial flies one set of gains on the baseline task from the same 64 `clear` starts with the same noise, of a seed
+that no evaluation uses. The cost is in seconds:
 
     cost = mean settling time of the position (an unsettled trial counts twice the duration)
          + 0.1 * the same of the yaw

@@ -70,8 +70,8 @@ def test_thrust_gives_way_to_roll_and_pitch(name):
     torque = (0.1 * weight * vehicle.lever, 0.1 * weight * vehicle.lever, 0.0)
     _, thrust, given_torque = delivered(vehicle, 10 * weight, torque)
     np.testing.assert_allclose(given_torque[:2], torque[:2], rtol=1e-4)
-    # of rotors 0 and 2, one is at its limit and the other (tau_x + tau_y) / (2 l) = 0.1 weights below it; 1 and 3 are both
-    # at the limit, where roll and pitch cancel
+    # of rotors 0 and 2, one is at its limit and the other (tau_x + tau_y) / (2 l) = 0.1 weights below it;
+    # 1 and 3 are both at the limit, where roll and pitch cancel
     np.testing.assert_allclose(thrust, largest - 0.1 * weight, rtol=1e-4)
 
 

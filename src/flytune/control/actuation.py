@@ -102,4 +102,3 @@ def action_for(
         )
     hover = vehicle.hover_rotor_speed_rpm
     return pack(tuple(jnp.clip((speed / hover - 1) / vehicle.action_scale, -1.0, 1.0) for speed in wanted))
-

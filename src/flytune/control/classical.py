@@ -3,7 +3,7 @@
 import math
 from importlib import resources
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any
 
 from flytune import document
 from flytune.control.controller import Controller
@@ -16,7 +16,7 @@ from flytune.pytree import label, pytree
 from flytune.task.task import Task
 from flytune.task.termination import MaximumBodyRate, MaximumTilt
 
-Which = Literal["tuned", "textbook"]
+SETS = ("tuned", "textbook")
 AnyGains = PidGains | GeometricGains | LqrGains
 
 
@@ -51,7 +51,7 @@ FILES: dict[str, Any] = {"geometric": GeometricFile, "lqr": LqrFile, "pid": PidF
 CLASSICAL = tuple(FILES)
 
 
-def classical_pilot(name: str, task: Task, gains: Which = "tuned") -> Controller:
+def classical_pilot(name: str, task: Task, gains: str = "tuned") -> Controller:
     """The classical pilot of a name for a task's vehicle, target heading and bounds.
 
     Args:
@@ -63,8 +63,8 @@ def classical_pilot(name: str, task: Task, gains: Which = "tuned") -> Controller
     Raises:
         BadInput: no such pilot or gains.
     """
-    if gains not in get_args(Which):
-        raise BadInput(f"gains: {gains!r} is not allowed. Allowed: {', '.join(get_args(Which))}.")
+    if gains not in SETS:
+        raise BadInput(f"gains: {gains!r} is not allowed. Allowed: {', '.join(SETS)}.")
     return pilot_with(getattr(read_gains(name), gains), task)
 
 

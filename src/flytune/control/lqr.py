@@ -9,15 +9,7 @@ from annotated_types import Gt, Le, Unit
 from jaxtyping import Array, Float
 from scipy.linalg import solve_discrete_are
 
-from flytune.control.actuation import (
-    PITCH,
-    YAW,
-    action_for,
-    allocate,
-    estimated_rotor_speed,
-    hovering_rotors,
-    mixed,
-)
+from flytune.control.actuation import PITCH, YAW, action_for, allocate, estimated_rotor_speed, hovering_rotors, mixed
 from flytune.control.sensing import Sensed, heading, sense, wrapped
 from flytune.control.steering import shortened, slowed
 from flytune.document import Real
@@ -29,8 +21,8 @@ from flytune.pytree import pytree
 
 STATES = 16
 STATE = (
-    "position error (3) [m] and velocity (3) [m/s] in axes that turn with the heading, roll, pitch and yaw error [rad], "
-    "body rate (3) [rad/s], rotor speed (4) in units of the action"
+    "position error (3) [m] and velocity (3) [m/s] in axes that turn with the heading, "
+    "roll, pitch and yaw error [rad], body rate (3) [rad/s], rotor speed (4) in units of the action"
 )
 Metres = Annotated[Real, Gt(0), Unit("m")]
 Speed = Annotated[Real, Gt(0), Unit("m/s")]
@@ -189,4 +181,3 @@ def _turned(vector: Components, yaw: Any) -> Components:
     x, y, z = vector
     c, s = jnp.cos(yaw), jnp.sin(yaw)
     return c * x + s * y, c * y - s * x, z
-

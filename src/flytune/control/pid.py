@@ -83,7 +83,7 @@ class Pid:
 
             v_ref = -k_p e_p, no longer than the speed limit;    a = k_v (v_ref - v) - k_i integral(e_p)
 
-        Anti-windup: the integral grows only within the integral zone, where no limit is met, and what it adds is bounded.
+        Anti-windup: the integral grows only within the integral zone, and what it adds is bounded.
         """
         g = self.gains
         pull = (g.horizontal_position, g.horizontal_position, g.vertical_position)
