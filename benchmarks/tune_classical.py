@@ -95,7 +95,7 @@ def write(name: str, gains: dict[str, float], path: Path, source: str) -> None:
 
 def main() -> None:
     """Tune what the command line names."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("names", nargs="+", choices=CLASSICAL)
     parser.add_argument("--trials", type=int, default=300, help="sets of gains to try per pilot (default 300)")
     parser.add_argument("--seed", type=int, default=0, help="of the sampler (default 0)")
