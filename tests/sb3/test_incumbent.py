@@ -5,50 +5,50 @@ import pytest
 pytest.importorskip("stable_baselines3", reason="needs flytune[sb3]")
 
 import contextlib
-import dataclasses
 import sys
+import time
 
 from flytune.bridges.sb3 import HoverVecEnv
-from flytune.errors import BadInput
 from flytune.learn import incumbent
 from flytune.task.task import load_task
 
 
-def test_what_is_not_installed_is_named_with_its_command_and_has_no_rate(monkeypatch):
-    for package, extras in [("pybullet", ("pybullet", "sb3")), ("stable_baselines3", ("sb3",))]:
-        with monkeypatch.context() as patch:
-            patch.setitem(sys.modules, package, None)
-            row = incumbent._row("A on B", (4, 1024), 4, lambda: 850.0, *extras)
-        command = f'pip install "flytune[{",".join(extras)}]"'
-        assert (row.steps_per_second, row.ratio, row.missing) == (None, None, command)
-        assert "not installed" in row.line() and command in row.line() and "4 x 1024" in row.line()
+def contender(what, run=lambda: None, extras=()):
+    return incumbent.Contender(
+        what=what, environments=4, steps=1024, extras=extras, prepare=lambda: contextlib.nullcontext(run)
+    )
 
 
-def test_what_is_installed_has_a_rate_and_its_ratio_to_the_first_row():
-    rates = {"first": 850.0, "second": 1700.0}
-    rows = [incumbent._row(name, (4, 10), 1, lambda rate=rate: rate, "sb3") for name, rate in rates.items()]
-    first, second = incumbent._with_ratios(rows)
-    assert (first.ratio, second.ratio) == (1.0, 2.0) and second.missing is None
-    assert "1,700 steps/s" in second.line() and "2.0 x" in second.line()
+@pytest.mark.parametrize(("package", "extras"), [("pybullet", ("pybullet", "sb3")), ("stable_baselines3", ("sb3",))])
+def test_what_is_not_installed_is_named_with_its_command_and_has_no_rate(monkeypatch, package, extras):
+    monkeypatch.setitem(sys.modules, package, None)
+    lacking, there = incumbent.measure([contender("A on B", extras=extras), contender("B")])
+    command = f'pip install "flytune[{",".join(extras)}]"'
+    assert (lacking.steps_per_second, lacking.ratio, lacking.missing) == (None, None, command)
+    assert "not installed" in lacking.line() and command in lacking.line() and "4 x 1024" in lacking.line()
+    assert there.steps_per_second > 0 and there.ratio is None and "steps/s" in there.line()
 
 
-def test_without_the_incumbent_there_is_no_ratio():
-    rows = [incumbent._row("A", (1, 1), 1, lambda: 3.0), incumbent._row("B", (1, 1), 1, lambda: 6.0)]
-    without = dataclasses.replace(rows[0], steps_per_second=None, missing="x")
-    assert incumbent._with_ratios([without, rows[1]])[1].ratio is None
+def test_rates_are_those_of_the_fastest_repetition_and_ratios_are_to_the_first():
+    waits = {"slow": [0.3, 0.04, 0.2, 0.04, 0.2, 0.04], "fast": [0.3, 0.02, 0.1, 0.02, 0.1, 0.02]}
+
+    def waiting(name):
+        return contender(name, lambda: time.sleep(waits[name].pop()), extras=("sb3",))
+
+    slow, fast = incumbent.measure([waiting("slow"), waiting("fast")])
+    assert slow.steps_per_second <= 4096 / 0.04 and fast.steps_per_second <= 4096 / 0.02
+    assert slow.ratio == 1 and fast.ratio == fast.steps_per_second / slow.steps_per_second
+    assert f"{fast.steps_per_second:,.0f} steps/s" in fast.line() and f"{fast.ratio:.1f} x" in fast.line()
 
 
-def test_a_refusal_that_is_no_missing_package_is_not_taken_for_one():
-    def refuse():
-        raise BadInput("world: 'x' is not allowed.")
-
-    with pytest.raises(BadInput, match="not allowed"):
-        incumbent._row("A", (1, 1), 1, refuse)
+def test_contenders_take_turns(monkeypatch):
+    order = []
+    incumbent.measure([contender(name, lambda name=name: order.append(name)) for name in "ab"])
+    assert order == list("ab" * (1 + incumbent.ROUNDS))
 
 
-def test_a_vector_of_environments_is_timed_over_all_its_steps(monkeypatch):
+def test_a_repetition_steps_every_environment_and_an_update_learns_from_them(monkeypatch):
     monkeypatch.setattr(incumbent, "STEPS", 20)
-    monkeypatch.setattr(incumbent, "UPDATES", 2)
     counted = []
 
     class Counting(HoverVecEnv):
@@ -56,7 +56,23 @@ def test_a_vector_of_environments_is_timed_over_all_its_steps(monkeypatch):
             counted.append(self.num_envs)
             return super().step_wait()
 
+    task = load_task("baseline", {"ppo.environments": 3, "ppo.rollout": 8, "ppo.minibatch": 24, "ppo.epochs": 1})
+
+    def made(number):
+        return contextlib.nullcontext(Counting(task, number))
+
+    with incumbent._stepping(made, 3) as run:
+        run()
+    assert counted == [3] * 20
+    with incumbent._training(task, made, 3, 8) as run:
+        model = run()
+    assert counted[20:] == [3] * 8 and model.num_timesteps == 24
+
+
+def test_the_simulators_compared_are_there_to_be_timed(monkeypatch):
+    pytest.importorskip("pybullet", reason="needs flytune[pybullet]")
+    monkeypatch.setattr(incumbent, "STEPS", 30)
     task = load_task("baseline")
-    rate = incumbent._step_vector(lambda number: contextlib.nullcontext(Counting(task, number)), 3)
-    assert counted == [3] * 60  # one repetition that is not counted, and two that are
-    assert rate > 0
+    for prepare in (incumbent._one(task, "pybullet"), incumbent._one(task, "flytune"), incumbent._alone(task)):
+        with prepare as run:
+            run()

@@ -13,8 +13,10 @@ import jax
 import numpy as np
 import torch
 
+from flytune.bridges.sb3 import HoverVecEnv
 from flytune.control.policy import load_policy
 from flytune.errors import BadInput, Diverged
+from flytune.export.sb3_model import actor_network
 from flytune.learn import sb3
 from flytune.learn.directory import RunDirectory
 from flytune.learn.run import _row, total_updates, train, with_steps
@@ -93,6 +95,15 @@ def test_an_interrupted_run_goes_on_to_the_same_result_bit_by_bit(task, whole, t
     assert_identical(whole.policy, resumed.policy)
     assert_identical(whole.last_policy, resumed.last_policy)
     assert without_times(whole.metrics) == without_times(resumed.metrics)
+
+
+def test_the_trainer_is_stable_baselines3s_own_training_bit_by_bit(task, whole):
+    # the same model left to itself for as many rollouts: what is put and taken in between changes nothing
+    seed = int(jax.random.bits(jax.random.key(1)))
+    model = sb3.make_model(task.ppo, HoverVecEnv(task, task.ppo.environments, seed), seed)
+    model.learn(task.ppo.steps)
+    weights = {name: weight.detach().numpy() for name, weight in model.policy.named_parameters()}
+    assert_identical(whole.last_policy.actor, actor_network(weights))
 
 
 def test_a_learner_can_be_moved_on_twice_and_gives_the_same(task):

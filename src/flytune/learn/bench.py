@@ -72,17 +72,17 @@ def bench(what: str = "all") -> Throughput:
     task = load_task("baseline")
     training, simulation = what in ("all", "train"), what in ("all", "simulate")
     product = _matrix_product()
-    ppo_rate = _training(ppo, task, task.ppo, steps_per_update(task, "ppo")) if training else None
+    ppo_update, fly = _training(ppo, task, task.ppo), _simulation(task)
+    ppo_rate = steps_per_update(task, "ppo") / _fastest(ppo_update) if training else None
     product = max(product, _matrix_product())  # the limit is what the machine can do undisturbed
-    simulate_rate = _simulation(task) if simulation else None
     return Throughput(
         matrix_product=product,
         ppo=ppo_rate,
         ppo_share_of_limit=ppo_rate * operations_per_step(task.ppo) / product if ppo_rate else None,
-        apg=_training(apg, task, task.apg, steps_per_update(task, "apg")) if training else None,
-        simulate=simulate_rate,
-        training=compare_training(task, ppo_rate) if ppo_rate else None,
-        simulation=compare_simulation(task, simulate_rate, SIMULATED) if simulate_rate else None,
+        apg=steps_per_update(task, "apg") / _fastest(_training(apg, task, task.apg)) if training else None,
+        simulate=SIMULATED[0] * SIMULATED[1] / _fastest(fly) if simulation else None,
+        training=compare_training(task, ppo_update) if training else None,
+        simulation=compare_simulation(task, fly, SIMULATED) if simulation else None,
         device=jax.devices()[0].platform,
         cores=os.cpu_count(),
     )
@@ -101,11 +101,11 @@ def operations_per_step(settings: PpoSettings) -> float:
 
 
 def _fastest(run: Callable[[], Any]) -> float:
-    jax.block_until_ready(run())
+    run()
     times = []
     for _ in range(REPEATS):
         started = time.perf_counter()
-        jax.block_until_ready(run())
+        run()
         times.append(time.perf_counter() - started)
     return min(times)
 
@@ -119,21 +119,24 @@ def _matrix_product() -> float:
     def chain(first: jax.Array) -> jax.Array:
         return jax.lax.scan(lambda x, _: (x @ second, None), first, length=number)[0]
 
-    return 2.0 * BATCH * WIDTH * WIDTH * number / _fastest(lambda: chain(first))
+    return 2.0 * BATCH * WIDTH * WIDTH * number / _fastest(lambda: jax.block_until_ready(chain(first)))
 
 
-def _training(teacher: Any, task: Task, settings: Any, samples: int) -> float:
-    learner = teacher.start(task, settings, jax.random.key(0))
+def _training(teacher: Any, task: Task, settings: Any) -> Callable[[], Any]:
+    """One update of a trainer, each going on from the one before."""
+    learner = None
 
     def one() -> Any:
         nonlocal learner
+        learner = teacher.start(task, settings, jax.random.key(0)) if learner is None else learner
         learner, seen = teacher.update(task, settings, learner)
-        return seen
+        return jax.block_until_ready(seen)
 
-    return samples / _fastest(one)
+    return one
 
 
-def _simulation(task: Task) -> float:
+def _simulation(task: Task) -> Callable[[], Any]:
+    """A flight of many episodes in one compiled call."""
     environments, steps = SIMULATED
     keys = jax.random.split(jax.random.key(0), environments)
     episodes = jax.vmap(lambda key: env.reset(task, key), out_axes=-1)(keys)
@@ -151,4 +154,4 @@ def _simulation(task: Task) -> float:
         batch = jax.vmap(one_step, in_axes=-1, out_axes=-1)
         return jax.lax.scan(lambda carry, now: batch(carry, *now), episodes, (normal, keys))[1].mean()
 
-    return environments * steps / _fastest(lambda: fly(episodes, jnp.asarray(jax.random.key(1))))
+    return lambda: jax.block_until_ready(fly(episodes, jnp.asarray(jax.random.key(1))))

@@ -14,9 +14,14 @@ from flytune.extras import require
 from flytune.task.task import Task
 
 PROCESSES = 4  # of the incumbent (paper R18)
-UPDATES, LONGEST = 5, 25.0  # repetitions of a measurement, fewer where they take longer (s); the fastest counts
+ROUNDS, LONGEST = 5, 120.0  # each round runs every contender once, so that other work on the machine slows all; s
 ROLLOUT = 1024  # steps per environment and update with 4 environments; the paper's 4,096 give the same rate
 STEPS = 2000  # per environment in one repetition of a simulation
+
+PACKAGES = {"pybullet": ("pybullet", "gymnasium"), "sb3": ("torch", "stable_baselines3"), "gymnasium": ("gymnasium",)}
+
+Repeat = Callable[[], Any]  # one repetition of a measurement
+Environments = Callable[[int], contextlib.AbstractContextManager[Any]]  # so many, in a vector of SB3's kind
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -40,84 +45,118 @@ class Row:
         return f"{self.what:38} {shape}   {self.steps_per_second:10,.0f} steps/s{ratio}"
 
 
-def compare_training(task: Task, own: float) -> list[Row]:
-    """Training by Stable-Baselines3 on PyBullet, on our environments, and by our own PPO, whose rate is `own`."""
-    settings = task.ppo
-    small, usual = (PROCESSES, ROLLOUT), (settings.environments, settings.rollout)
-    pybullet, own_environments = partial(_pybullet_processes, task), partial(_own_environments, task)
-    return _with_ratios(
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Contender:
+    """What is to be measured: its shape as in `Row`, the extras it needs, and how it is set up."""
+
+    what: str
+    environments: int
+    steps: int
+    processes: int = 1
+    extras: tuple[str, ...] = ()
+    prepare: Callable[[], contextlib.AbstractContextManager[Repeat]]
+
+
+def compare_training(task: Task, own: Repeat) -> list[Row]:
+    """Training by Stable-Baselines3 on PyBullet and on our environments, and by our own PPO, whose update is `own`."""
+    number, rollout = task.ppo.environments, task.ppo.rollout
+    elsewhere, here = partial(_pybullet_processes, task), partial(_own_environments, task)
+
+    def contender(what: str, environments: Environments, number: int, steps: int, **options: Any) -> Contender:
+        prepare = partial(_training, task, environments, number, steps)
+        return Contender(what=what, environments=number, steps=steps, prepare=prepare, **options)
+
+    both, sb3 = ("pybullet", "sb3"), ("sb3",)
+    return measure(
         [
-            _row("SB3 PPO on PyBullet", small, PROCESSES, partial(_train, task, pybullet, small), "pybullet", "sb3"),
-            _row("SB3 PPO on flytune", small, 1, partial(_train, task, own_environments, small), "sb3"),
-            _row("SB3 PPO on flytune", usual, 1, partial(_train, task, own_environments, usual), "sb3"),
-            _row("flytune PPO", usual, 1, lambda: own),
+            contender("SB3 PPO on PyBullet", elsewhere, PROCESSES, ROLLOUT, processes=PROCESSES, extras=both),
+            contender("SB3 PPO on flytune", here, PROCESSES, ROLLOUT, extras=sb3),
+            contender("SB3 PPO on flytune", here, number, rollout, extras=sb3),
+            Contender(what="flytune PPO", environments=number, steps=rollout, prepare=lambda: _ready(own)),
         ]
     )
 
 
-def compare_simulation(task: Task, own: float, own_shape: tuple[int, int]) -> list[Row]:
+def compare_simulation(task: Task, own: Repeat, own_shape: tuple[int, int]) -> list[Row]:
     """Simulation in PyBullet, by our environments for other people's trainers, and compiled as a whole (`own`)."""
-    processes, width = partial(_pybullet_processes, task), task.ppo.environments
-    return _with_ratios(
+    width = task.ppo.environments
+
+    def contender(what: str, number: int, prepare: Any, *extras: str, processes: int = 1) -> Contender:
+        return Contender(
+            what=what, environments=number, steps=STEPS, prepare=prepare, extras=extras, processes=processes
+        )
+
+    processes = partial(_stepping, partial(_pybullet_processes, task), PROCESSES)
+    vector = partial(_stepping, partial(_own_environments, task), width)
+    return measure(
         [
-            _row("PyBullet, Gymnasium, SubprocVecEnv", (PROCESSES, STEPS), PROCESSES,
-                 partial(_step_vector, processes, PROCESSES), "pybullet", "sb3"),
-            _row("PyBullet, Gymnasium", (1, STEPS), 1, lambda: _step_single(task, "pybullet")[0], "pybullet"),
-            _row("PyBullet alone, without Gymnasium", (1, STEPS), 1, lambda: _step_single(task, "pybullet")[1],
-                 "pybullet"),
-            _row("flytune, Gymnasium", (1, STEPS), 1, lambda: _step_single(task, "flytune")[0], "gymnasium"),
-            _row("flytune, VecEnv", (width, STEPS), 1,
-                 partial(_step_vector, partial(_own_environments, task), width), "sb3"),
-            _row("flytune, compiled", own_shape, 1, lambda: own),
+            contender("PyBullet, SubprocVecEnv", PROCESSES, processes, "pybullet", "sb3", processes=PROCESSES),
+            contender("PyBullet, Gymnasium", 1, partial(_one, task, "pybullet"), "pybullet"),
+            contender("PyBullet alone, no rewards", 1, partial(_alone, task), "pybullet"),
+            contender("flytune, Gymnasium", 1, partial(_one, task, "flytune"), "gymnasium"),
+            contender("flytune, VecEnv", width, vector, "sb3"),
+            Contender(
+                what="flytune, compiled",
+                environments=own_shape[0],
+                steps=own_shape[1],
+                prepare=lambda: _ready(own),
+            ),
         ]
-    )  # fmt: skip
+    )
 
 
-def _row(what: str, shape: tuple[int, int], processes: int, measure: Callable[[], float], *extras: str) -> Row:
-    packages = {
-        "pybullet": ("pybullet", "gymnasium"),
-        "sb3": ("torch", "stable_baselines3"),
-        "gymnasium": ("gymnasium",),
-    }
-    missing, rate = None, None
+def measure(contenders: list[Contender]) -> list[Row]:
+    """A row for each contender: the fastest of its repetitions, and its ratio to the first."""
+    missing = [_missing(contender.extras) for contender in contenders]
+    with contextlib.ExitStack() as stack:
+        runs = [
+            None if lacks else stack.enter_context(contender.prepare())
+            for contender, lacks in zip(contenders, missing, strict=True)
+        ]
+        fastest = _fastest([run for run in runs if run is not None])
+    seconds = [fastest.pop(0) if run is not None else None for run in runs]
+    rates = [
+        None if time_ is None else contender.environments * contender.steps / time_
+        for contender, time_ in zip(contenders, seconds, strict=True)
+    ]
+    return [
+        Row(
+            what=contender.what,
+            environments=contender.environments,
+            steps=contender.steps,
+            processes=contender.processes,
+            steps_per_second=rate,
+            ratio=rate / rates[0] if rate and rates[0] else None,
+            missing=lacks,
+        )
+        for contender, rate, lacks in zip(contenders, rates, missing, strict=True)
+    ]
+
+
+def _missing(extras: tuple[str, ...]) -> str | None:
+    """The command that installs what of some extras is not there, or None."""
     try:
         for extra in extras:
-            for package in packages[extra]:
+            for package in PACKAGES[extra]:
                 require(package, extra)
-        rate = measure()
-    except BadInput as error:
-        if "is not installed" not in str(error):
-            raise
-        missing = f'pip install "flytune[{",".join(extras)}]"'
-    environments, steps = shape
-    return Row(
-        what=what,
-        environments=environments,
-        steps=steps,
-        processes=processes,
-        steps_per_second=rate,
-        missing=missing,
-    )
+    except BadInput:
+        return f'pip install "flytune[{",".join(extras)}]"'
+    return None
 
 
-def _with_ratios(rows: list[Row]) -> list[Row]:
-    base = rows[0].steps_per_second
-
-    def ratio(row: Row) -> float | None:
-        return row.steps_per_second / base if base and row.steps_per_second else None
-
-    return [dataclasses.replace(row, ratio=ratio(row)) for row in rows]
-
-
-def _fastest(once: Callable[[], Any]) -> float:
-    """Seconds of the fastest of some repetitions, after one that is not counted."""
-    once()
-    times, began = [], time.perf_counter()
-    while len(times) < UPDATES and (not times or time.perf_counter() - began < LONGEST):
-        started = time.perf_counter()
-        once()
-        times.append(time.perf_counter() - started)
-    return min(times)
+def _fastest(runs: list[Repeat]) -> list[float]:
+    """Seconds of the fastest repetition of each, after one that is not counted."""
+    for run in runs:
+        run()
+    best, began = [float("inf")] * len(runs), time.perf_counter()
+    for number in range(ROUNDS):
+        if number and time.perf_counter() - began > LONGEST:
+            break
+        for index, run in enumerate(runs):
+            started = time.perf_counter()
+            run()
+            best[index] = min(best[index], time.perf_counter() - started)
+    return best
 
 
 def make_environment(task: Task) -> Any:
@@ -147,61 +186,71 @@ def _own_environments(task: Task, number: int) -> Iterator[Any]:
     yield HoverVecEnv(task, number)
 
 
-def _train(task: Task, environments: Callable[[int], Any], shape: tuple[int, int]) -> float:
-    """Environment steps per second of Stable-Baselines3's PPO with the task's settings, rollouts and epochs."""
+@contextlib.contextmanager
+def _ready(run: Repeat) -> Iterator[Repeat]:
+    yield run
+
+
+@contextlib.contextmanager
+def _training(task: Task, environments: Environments, number: int, rollout: int) -> Iterator[Repeat]:
+    """One update of Stable-Baselines3's PPO: a rollout and the task's epochs."""
     import torch
 
     from flytune.learn.sb3 import make_model
 
-    number, rollout = shape
     threads = torch.get_num_threads()
     torch.set_num_threads(1)  # faster at this size, for the incumbent too
     try:
         with environments(number) as made:
             settings = dataclasses.replace(task.ppo, environments=number, rollout=rollout)
             model = make_model(settings, made, seed=0)
-            return number * rollout / _fastest(lambda: model.learn(number * rollout, reset_num_timesteps=False))
+            yield lambda: model.learn(number * rollout, reset_num_timesteps=False)
     finally:
         torch.set_num_threads(threads)
 
 
-def _step_vector(environments: Callable[[int], Any], number: int) -> float:
-    generator = np.random.default_rng(0)
-    actions = generator.uniform(-0.3, 0.3, (STEPS, number, 4)).astype(np.float32)
+def _actions(*shape: int) -> np.ndarray:
+    return np.random.default_rng(0).uniform(-0.3, 0.3, (STEPS, *shape, 4)).astype(np.float32)
+
+
+@contextlib.contextmanager
+def _stepping(environments: Environments, number: int) -> Iterator[Repeat]:
+    """Steps of a vector environment."""
+    actions = _actions(number)
     with environments(number) as made:
         made.reset()
-
-        def once() -> None:
-            for action in actions:
-                made.step(action)
-
-        return number * STEPS / _fastest(once)
+        yield lambda: [made.step(action) for action in actions]
 
 
-def _step_single(task: Task, world: str) -> tuple[float, float]:
-    """Steps per second of one environment, and of the physics in it without what makes it an environment."""
+@contextlib.contextmanager
+def _one(task: Task, world: str) -> Iterator[Repeat]:
+    """Steps of one environment of Gymnasium."""
     from flytune.bridges.gymnasium import HoverEnv
-    from flytune.bridges.worlds import make_world
 
-    environment = HoverEnv(task, world=world)
-    actions = np.random.default_rng(0).uniform(-0.3, 0.3, (STEPS, 4)).astype(np.float32)
+    environment, actions = HoverEnv(task, world=world), _actions()
     environment.reset(seed=0)
 
-    def once() -> None:
+    def run() -> None:
         for action in actions:
             _, _, terminated, truncated, _ = environment.step(action)
             if terminated or truncated:
                 environment.reset()
 
-    whole = _fastest(once)
+    yield run
     environment.close()
-    simulator = make_world(world, task.vehicle, 1)
 
-    def physics() -> None:
+
+@contextlib.contextmanager
+def _alone(task: Task) -> Iterator[Repeat]:
+    """Steps of PyBullet's physics, without what makes an environment of it."""
+    from flytune.bridges.worlds import make_world
+
+    simulator, actions = make_world("pybullet", task.vehicle, 1), _actions(1)
+
+    def run() -> None:
         for action in actions:
-            simulator.advance(action[None])
+            simulator.advance(action)
             simulator.body()
 
-    alone = _fastest(physics)
+    yield run
     simulator.close()
-    return STEPS / whole, STEPS / alone

@@ -54,7 +54,6 @@ class Learner:
     episodes: Episode  # a batch, along the last axis
     key: Any  # raw, of starts and noise
     observation: Any  # [N, 17] last seen
-    ended: Any  # [N] bool; whether the last step ended an episode
     torch_random: Any  # the state of torch's generator: actions
     numpy_random: Any  # the state of NumPy's: minibatches
     minibatches: Array  # Adam's steps
@@ -142,7 +141,6 @@ class _Workbench:
         self.task, self.settings = task, settings
         self.environments = HoverVecEnv(task, settings.environments, seed)
         self.model = make_model(settings, self.environments, seed)
-        self.ended = np.ones(settings.environments, bool)
 
     def put(self, learner: Learner) -> None:
         """Bring model, environments and random numbers to where a learner is."""
@@ -167,7 +165,6 @@ class _Workbench:
         batch.episodes = jax.tree.map(jnp.array, learner.episodes)
         batch.key = jax.random.wrap_key_data(jnp.array(learner.key))
         batch.observation = np.array(learner.observation)
-        self.ended = np.array(learner.ended)
         numbers = np.array(learner.numpy_random)
         # the global one, since it is what Stable-Baselines3 draws from
         np.random.set_state(  # noqa: NPY002
@@ -198,7 +195,6 @@ class _Workbench:
             "episodes": jax.tree.map(np.array, batch.episodes),
             "key": np.array(jax.random.key_data(batch.key)),
             "observation": batch.observation.copy(),
-            "ended": self.ended.copy(),
             "torch_random": torch.get_rng_state().numpy().copy(),
             "numpy_random": np.append(state["key"], np.uint32(state["pos"])),
             "minibatches": jnp.asarray(max(steps, default=0), jnp.int32),
@@ -219,7 +215,9 @@ class _Workbench:
                 transitions.append(environments.transition)
                 return True
 
-        self.model._last_obs, self.model._last_episode_starts = environments.batch.observation, self.ended
+        self.model._last_obs = environments.batch.observation
+        # whether a rollout's first step began an episode: kept for those that look further back, and nobody here does
+        self.model._last_episode_starts = np.ones(self.settings.environments, bool)
         samples = self.settings.environments * self.settings.rollout
         try:
             # one rollout and its epochs, so that the second, the first to be logged, never comes
@@ -232,7 +230,6 @@ class _Workbench:
                 f"training: the weights stop being finite in update {number} ({number * samples} environment steps). "
                 "A smaller learning_rate, or smaller weights in the reward, may help."
             ) from None
-        self.ended = np.array(self.model._last_episode_starts)
         logged = self.model.logger.name_to_value
         return {**_account(self.task, transitions), **{name: np.asarray(logged[key]) for name, key in LOSSES.items()}}
 
