@@ -268,4 +268,5 @@ def _finish(figure: go.Figure, names: Sequence[str], pilots: Sequence[int], heig
         figure.add_trace(entry.update(legendgroup=str(pilot)))
     margin = {"l": 66, "r": 14, "t": style.room_for_names(len(pilots)), "b": 48}
     figure = style.frame(figure, height + margin["t"] + margin["b"], margin=margin, **layout)
+    figure.update_annotations(font_size=11.5)  # titles of four panels side by side
     return style.legend_below_tools(figure)

@@ -45,8 +45,8 @@ def frame(figure: go.Figure, height: int, **layout: Any) -> go.Figure:
 
 
 def room_for_names(number: int) -> int:
-    """Pixels above the panels for the buttons, a legend of so many names that may all be long, and the titles."""
-    return 84 + 20 * ((number - 1) // 2)
+    """Pixels above the panels for the buttons, a legend of so many names, two to a line if long, and the titles."""
+    return 56 + 29 * -(-number // 2)
 
 
 def legend_below_tools(figure: go.Figure) -> go.Figure:
