@@ -87,6 +87,15 @@ def plain(node: Any) -> dict[str, Any]:
     return result
 
 
+def overlay(below: Mapping[str, Any], above: Mapping[str, Any]) -> dict[str, Any]:
+    """Nested tables with those of `above` laid over them: a table adds to a table, any other value replaces."""
+    result = dict(below)
+    for key, value in above.items():
+        both = isinstance(value, Mapping) and isinstance(result.get(key), Mapping)
+        result[key] = overlay(result[key], value) if both else value
+    return result
+
+
 def edit(data: Mapping[str, Any], path: str, value: Any) -> dict[str, Any]:
     """The same tables with the field at a dotted path replaced.
 

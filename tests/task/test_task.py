@@ -6,6 +6,7 @@ import math
 import jax
 import pytest
 
+from flytune import document
 from flytune.errors import BadInput
 from flytune.physics.vehicle import load_vehicle, vehicle_names
 from flytune.task.reward import DualExponential, Exponential, Smoothness, Survival
@@ -51,8 +52,8 @@ def refusal(task="baseline", **edits):
 # --- what ships ---
 
 
-def test_the_three_presets_of_the_paper_ship():
-    assert preset_names() == ["acrobatic", "baseline", "inspection"]
+def test_the_three_presets_of_the_paper_ship_each_with_a_refined_one():
+    assert preset_names() == sorted([*PAPER_REWARDS, *(f"{name}-refined" for name in PAPER_REWARDS)])
 
 
 @pytest.mark.parametrize("preset", PAPER_REWARDS)
@@ -73,7 +74,7 @@ def test_a_preset_flies_the_papers_vehicle_to_the_papers_target(tasks, preset):
 
 
 def test_a_trial_lasts_ten_seconds_and_twenty_for_the_slow_inspection(tasks):
-    assert {name: task.duration for name, task in tasks.items()} == {
+    assert {name: tasks[name].duration for name in PAPER_REWARDS} == {
         "acrobatic": 10,
         "baseline": 10,
         "inspection": 20,
@@ -92,7 +93,7 @@ def test_a_preset_is_learned_with_the_papers_settings(tasks, preset):
 
 
 def test_the_speed_bound_is_the_tightest_speed_termination(tasks):
-    assert {name: task.speed_bound for name, task in tasks.items()} == {
+    assert {name: tasks[name].speed_bound for name in PAPER_REWARDS} == {
         "acrobatic": 1.0,
         "baseline": 0.8,
         "inspection": 0.2,
@@ -192,7 +193,10 @@ def test_a_term_may_be_added_and_needs_to_be_complete():
 
 def test_an_unknown_preset_is_refused_with_the_nearest_name():
     text = refusal("baselin")
-    assert text.startswith("task: 'baselin' is no preset. Allowed: acrobatic, baseline, inspection, or a .toml file.")
+    allowed = (
+        "acrobatic, acrobatic-refined, baseline, baseline-refined, inspection, inspection-refined, or a .toml file."
+    )
+    assert text.startswith(f"task: 'baselin' is no preset. Allowed: {allowed}")
     assert text.endswith("Did you mean baseline?")
     assert "Did you mean" not in refusal("zzz")
 
@@ -264,3 +268,42 @@ def test_a_missing_file_is_refused(tmp_path):
 def test_a_text_that_is_no_complete_task_is_refused():
     with pytest.raises(BadInput, match=r"^old/task\.toml: .*: missing\."):
         read_task_text("horizon = 3", "old/task.toml")
+
+
+def test_a_file_based_on_a_preset_says_only_what_it_changes(tmp_path):
+    file = tmp_path / "mine.toml"
+    changes = ["[reward.velocity]", "weight = 0.2", "[sources]", '"reward.velocity.weight" = "mine"']
+    file.write_text("\n".join(['based_on = "baseline"', *changes]))
+    task, base = load_task(file), load_task("baseline")
+    assert task.name == "mine"
+    assert task.reward["velocity"].weight == 0.2
+    assert task.reward["velocity"].sharpness == base.reward["velocity"].sharpness
+    assert document.plain(task)["termination"] == document.plain(base)["termination"]
+    assert task.sources["reward.velocity.weight"] == "mine" and task.sources["reward"] == "paper R11"
+
+
+def test_a_file_based_on_nothing_that_ships_is_refused(tmp_path):
+    file = tmp_path / "mine.toml"
+    file.write_text('based_on = "besaline"\n')
+    with pytest.raises(BadInput, match=r"based_on: 'besaline' is no preset\. Allowed: acrobatic"):
+        load_task(file)
+
+
+@pytest.mark.parametrize("role", ["baseline", "acrobatic", "inspection"])
+def test_a_refined_preset_gives_a_reason_for_everything_it_changes(role):
+    def leaves(table, path=""):
+        for name, value in table.items():
+            if isinstance(value, dict):
+                yield from leaves(value, f"{path}{name}.")
+            else:
+                yield f"{path}{name}", value
+
+    refined, printed = (load_task(name) for name in (f"{role}-refined", role))
+    before = dict(leaves(document.plain(printed)))
+    changed = {
+        path
+        for path, value in leaves(document.plain(refined))
+        if not path.startswith(("name", "sources")) and before.get(path) != value
+    }
+    assert changed
+    assert {path for path in changed if not refined.sources.get(path, "").startswith("refined: ")} == set()

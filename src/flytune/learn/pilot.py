@@ -51,7 +51,7 @@ def find_pilot(who: str, task: str | Task | None = None) -> Pilot:
     name, at, gains = who.partition("@")
     if name in CLASSICAL:
         flown = wanted or load_task("baseline")
-        controller = classical_pilot(name, flown, gains if at else "tuned")  # pyright: ignore[reportArgumentType]  (it checks the name)
+        controller = classical_pilot(name, flown, gains if at else "tuned")
         about = {"controller": name, "gains": gains or "tuned"}
         return Pilot(name=who, controller=controller, task=flown, metrics=None, about=about)
     if who in shipped_names():

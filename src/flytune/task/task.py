@@ -65,7 +65,8 @@ def load_task(task: str | Path, edits: dict[str, Any] | None = None) -> Task:
     """A task by preset name or TOML file, with edits applied.
 
     Args:
-        task: `baseline`, `acrobatic`, `inspection`, or the path of a .toml file.
+        task: a preset (`baseline`, `acrobatic`, `inspection`, or one of them `-refined`), or the path of a .toml file,
+            which may say `based_on = "PRESET"` and then only what it changes.
         edits: field path -> value, for instance {"reward.velocity.weight": 0.08}; `vehicle` also takes a name.
 
     Raises:
@@ -73,11 +74,9 @@ def load_task(task: str | Path, edits: dict[str, Any] | None = None) -> Task:
     """
     name = str(task)
     if name in preset_names():
-        with resources.as_file(resources.files("flytune.task") / "presets" / f"{name}.toml") as path:
-            data = {"name": name, **document.load(path)}
-        where = ""
+        data, where = _preset(name), ""
     elif name.endswith(".toml") or os.path.isfile(name):
-        data = {"name": Path(name).stem, **document.load(Path(name))}
+        data = _on_its_base({"name": Path(name).stem, **document.load(Path(name))}, name)
         where = name
     else:
         hint = document.nearest(name, preset_names())
@@ -91,6 +90,23 @@ def load_task(task: str | Path, edits: dict[str, Any] | None = None) -> Task:
     for path, value in edits.items():
         complete = _edited(complete, path, value)
     return document.read(Task, complete)
+
+
+def _preset(name: str) -> dict[str, Any]:
+    """The tables of a preset."""
+    with resources.as_file(resources.files("flytune.task") / "presets" / f"{name}.toml") as path:
+        return _on_its_base({"name": name, **document.load(path)}, name)
+
+
+def _on_its_base(data: dict[str, Any], where: str) -> dict[str, Any]:
+    """The tables laid over those of the preset that `based_on` names, so that a file need only say what it changes."""
+    if "based_on" not in data:
+        return data
+    changes = {key: value for key, value in data.items() if key != "based_on"}
+    base = data["based_on"]
+    if base not in preset_names():
+        raise BadInput(f"{where}: based_on: {base!r} is no preset. Allowed: {', '.join(preset_names())}.")
+    return document.overlay(_preset(base), changes)
 
 
 def read_task_text(text: str, where: str) -> Task:
