@@ -17,7 +17,7 @@ from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
-from integrator import manoeuvre
+from integrator import METHODS, errors, manoeuvre
 from integrator import reference as dop853
 
 from flytune.bridges.actuator import SIDE, SPIN, Actuator
@@ -133,7 +133,9 @@ def compare_integrators(vehicle: Vehicle, actions: np.ndarray) -> None:
     exact, own = equations(vehicle, actions), fly_open_loop(vehicle, actions, "flytune", {})
     heading("world", "position [m]", "attitude [rad]", "rate [rad/s]", "position, from flytune [m]")
     row("equations, solved by DOP853", apart(dop853(vehicle, actions), exact), apart(dop853(vehicle, actions), own)[:1])
-    row("flytune (float32)", apart(own, exact), [0.0])
+    row("flytune", apart(own, exact), [0.0])
+    position, attitude, _, rate = errors(METHODS["flytune, 1"], vehicle, actions, exact, double=True)
+    row("flytune, in float64", [position, attitude, rate])
     for label, name, options in (
         ("MuJoCo, RK4, 200 Hz", "mujoco", {}),
         ("MuJoCo, Euler, 200 Hz", "mujoco", {"integrator": "Euler"}),
