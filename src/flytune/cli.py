@@ -98,7 +98,7 @@ def _add_trial_options(command: argparse.ArgumentParser) -> None:
                          help=f"{TASK_HELP} (default: the one it was trained for)")  # fmt: skip
     command.add_argument("--world", choices=WORLDS, default="flytune", help="the simulator to fly in")
     command.add_argument("--world-set", nargs="+", action="extend", default=[], metavar="NAME=VALUE",
-                         dest="world_edits", help="options of the simulator: damping=0.04 ground_effect=true ...")  # fmt: skip
+                         dest="world_edits", help="its options: damping=0.04 ground_effect=true ...")  # fmt: skip
     command.add_argument("--trials", type=int, default=100, help="number of trials")
     command.add_argument("--seed", type=int, default=1, help="of starts and noise")
     command.add_argument("--duration", type=float, default=argparse.SUPPRESS, metavar="S",
