@@ -169,7 +169,7 @@ def _add_show(commands: Any) -> None:
 
 
 def _add_bench(commands: Any) -> None:
-    command = _command(commands, "bench", _bench, "measure throughput on this machine")
+    command = _command(commands, "bench", _bench, "measure throughput here, and that of what is installed beside us")
     command.add_argument("what", nargs="?", choices=("all", "train", "simulate"), default="all", help="what to measure")
     command.add_argument("--json", action="store_true", help="print one JSON object instead of the table")
 

@@ -134,14 +134,15 @@ def read_facts(directory: Path) -> dict[str, Any]:
 
 
 def _facts(task: Task, trainer: str, seed: int) -> dict[str, Any]:
+    packages = ["flytune", "jax", "jaxlib", "numpy", "optax"]
+    packages += ["stable_baselines3", "torch"] if trainer == "sb3" else []
     return {
         "task": task.name,
         "trainer": trainer,
         "seed": seed,
         "command": [Path(sys.argv[0]).name, *sys.argv[1:]],
         "time": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
-        "versions": {name: metadata.version(name) for name in ("flytune", "jax", "jaxlib", "numpy", "optax")}
-        | {"python": platform.python_version()},
+        "versions": {name: metadata.version(name) for name in packages} | {"python": platform.python_version()},
         "machine": {"system": platform.system(), "processor": platform.machine(), "cores": os.cpu_count()},
         "device": jax.devices()[0].platform,
         "commit": _commit(),

@@ -55,8 +55,8 @@ def boxes(evidence: Evidence, flown: Flown, condition: str, unit: Callable[[str]
             finite = values[np.isfinite(values)] * scale
             ticks.append(f"{role}<br>{finite.size} of {values.size}")
             figure.add_trace(plots.box(finite, place, role, COLOURS[role]), row=1, col=panel)
-        place: dict[str, Any] = {"row": 1, "col": panel}
-        figure.update_xaxes(tickvals=list(range(len(ROLES))), ticktext=ticks, range=[-0.6, len(ROLES) - 0.4], **place)
+        here: dict[str, Any] = {"row": 1, "col": panel}
+        figure.update_xaxes(tickvals=list(range(len(ROLES))), ticktext=ticks, range=[-0.6, len(ROLES) - 0.4], **here)
         figure.update_yaxes(title_text=f"[{symbol}]", rangemode="tozero", row=1, col=panel)
     figure.update_xaxes(showgrid=False, tickangle=0, tickfont_size=10)
     return style.frame(figure, 400, showlegend=False)
