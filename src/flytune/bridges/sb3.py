@@ -1,5 +1,8 @@
 """Our batch of episodes as a vector environment of Stable-Baselines3: one compiled call steps all of them."""
 
+# pyright: reportMissingImports=false
+# PyTorch is in no pinned requirement; without it the rest is checked all the same
+
 import time
 from collections.abc import Iterable
 from typing import Any

@@ -5,6 +5,9 @@ a learner is put on for one update and taken from again. So a checkpoint holds a
 goes on bit by bit.
 """
 
+# pyright: reportMissingImports=false
+# PyTorch is in no pinned requirement; without it the rest is checked all the same
+
 import contextlib
 import random
 from collections.abc import Iterator
