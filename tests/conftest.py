@@ -1,9 +1,12 @@
 """What every test shares: a single-threaded XLA, a compilation cache, and types that are checked while tests run."""
 
 import os
+import shutil
 import sys
 from pathlib import Path
 from types import ModuleType
+
+import pytest
 
 os.environ.setdefault("XLA_FLAGS", "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1")
 os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(Path(__file__).parents[1] / ".jax_cache"))
@@ -11,6 +14,7 @@ os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.3")
 
 from beartype import beartype
 from jaxtyping import install_import_hook
+from tests.chromium import BROWSERS, ON_A_MAC, Browser
 
 # without physics.vehicle, whose properties promise a float and give a tracer in compiled code, and without
 # response.fly and the rooms above it, which refuse a bad argument in their own words
@@ -25,3 +29,15 @@ def check_functions(function):
 sys.modules["flytune_type_checker"] = checker = ModuleType("flytune_type_checker")
 checker.check_functions = check_functions
 install_import_hook([f"flytune.{name}" for name in CHECKED.split(", ")], "flytune_type_checker.check_functions")
+
+
+@pytest.fixture(scope="session")
+def browser(tmp_path_factory):
+    """A running headless Chromium; skips where there is none, except in continuous integration, where it fails."""
+    found = [path for name in BROWSERS if (path := shutil.which(name))] + [p for p in ON_A_MAC if Path(p).exists()]
+    if not found:
+        reason = f"no browser: none of {', '.join(BROWSERS)} is installed"
+        pytest.fail(reason) if os.environ.get("CI") else pytest.skip(reason)
+    running = Browser(found[0], tmp_path_factory.mktemp("profile"))
+    yield running
+    running.close()

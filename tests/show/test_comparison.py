@@ -7,6 +7,7 @@ from html.parser import HTMLParser
 
 import numpy as np
 import pytest
+from tests.chromium import DRAWN, MISPLACED, assert_quiet
 
 from flytune.errors import BadInput
 from flytune.response.compare import compare
@@ -15,7 +16,6 @@ from flytune.show import comparison_plots, comparison_tables
 from flytune.show.comparison import write_comparison
 
 HOSTILE = """<script>alert(1)</script><img src=x onerror='alert(2)'>"</script><!--&amp;%{x}"""
-ALLOWED = ("file:", "data:", "blob:")
 
 
 class Reader(HTMLParser):
@@ -244,29 +244,6 @@ def test_a_place_that_cannot_be_written_is_refused(make_pilot, tmp_path):
 
 # --- a browser ---
 
-# how many lines, boxes and dots of the traces have a size
-DRAWN = """
-[...document.querySelectorAll(".figure > div")[%d].querySelectorAll(".scatterlayer path, .boxlayer path")]
-  .filter(path => path.getBBox().width + path.getBBox().height > 0).length
-"""
-
-# texts of a figure that leave it, and names that lie upon a title, a curve's panel or the buttons
-MISPLACED = """
-(plot => {
-  const box = element => element.getBoundingClientRect();
-  const whole = box(plot);
-  const texts = [...plot.querySelectorAll("text")].filter(text => text.textContent.trim() && box(text).width > 0);
-  const out = texts.filter(text => box(text).left < whole.left - 1 || box(text).right > whole.right + 1
-    || box(text).bottom > whole.bottom + 1 || box(text).top < whole.top - 1);
-  const others = [...plot.querySelectorAll(".annotation-text, .modebar-btn, .xy > .plot, .bglayer rect.bg")];
-  const names = [...plot.querySelectorAll(".legendtext")].filter(name => others.some(other => {
-    const [a, b] = [box(name), box(other)];
-    return b.width > 0 && a.left < b.right && b.left < a.right && a.top < b.bottom && b.top < a.bottom;
-  }));
-  return [...out, ...names].map(text => text.textContent);
-})(document.querySelectorAll(".figure > div")[%d])
-"""
-
 
 @pytest.mark.browser
 @pytest.mark.parametrize(("pilots", "width"), [(2, 1200), (6, 900), (6, 400)])
@@ -287,9 +264,4 @@ def test_a_browser_draws_every_figure_with_nothing_misplaced(browser, six, tmp_p
         assert browser.evaluate("document.documentElement.scrollWidth") <= width
     finally:
         browser.call("Emulation.clearDeviceMetricsOverride")
-    for event in browser.events:
-        method, told = event["method"], event.get("params", {})
-        assert method not in ("Runtime.exceptionThrown", "Page.javascriptDialogOpening"), told
-        assert method != "Log.entryAdded" or told["entry"]["level"] != "error", told
-        assert method != "Runtime.consoleAPICalled" or told["type"] not in ("error", "warning", "assert"), told
-        assert method != "Network.requestWillBeSent" or told["request"]["url"].startswith(ALLOWED), told
+    assert_quiet(browser)

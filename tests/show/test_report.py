@@ -5,13 +5,13 @@ from html.parser import HTMLParser
 
 import numpy as np
 import pytest
+from tests.chromium import DRAWN, assert_quiet
 
 from flytune.errors import BadInput
 from flytune.show.report import write_report
 from flytune.task.task import write_task
 
 HOSTILE = """<script>alert(1)</script><img src=x onerror='alert(2)'>"</script><!--&amp;%{x}"""
-ALLOWED = ("file:", "data:", "blob:")
 
 
 class Reader(HTMLParser):
@@ -211,12 +211,6 @@ def test_a_report_without_a_policy_is_refused(tmp_path):
         write_report(tmp_path / "report.html", [])
 
 
-# how many lines, boxes and dots of the traces have a size
-DRAWN = """
-[...document.querySelectorAll(".figure > div")[%d].querySelectorAll(".scatterlayer path, .boxlayer path")]
-  .filter(path => path.getBBox().width + path.getBBox().height > 0).length
-"""
-
 # how many pixels of a figure in space have a colour, with the traces and without
 COLOURED = """
 (async number => {
@@ -252,12 +246,7 @@ def look_at(browser, path):
         browser.wait_for(f"{plot}.querySelector('.main-svg')?.getBoundingClientRect().width > 300")
         in_space = browser.evaluate(f"{plot}.dataset.space === 'yes'")
         assert browser.evaluate((COLOURED if in_space else DRAWN) % index) > 0, f"figure {index} is empty"
-    for event in browser.events:
-        method, told = event["method"], event.get("params", {})
-        assert method not in ("Runtime.exceptionThrown", "Page.javascriptDialogOpening"), told
-        assert method != "Log.entryAdded" or told["entry"]["level"] != "error", told
-        assert method != "Runtime.consoleAPICalled" or told["type"] not in ("error", "warning", "assert"), told
-        assert method != "Network.requestWillBeSent" or told["request"]["url"].startswith(ALLOWED), told
+    assert_quiet(browser)
     return number
 
 
