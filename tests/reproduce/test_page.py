@@ -7,6 +7,7 @@ import pytest
 from tests.chromium import DRAWN, assert_quiet
 
 from flytune.reproduce.figures import write_figures
+from flytune.reproduce.markdown import markdown
 from flytune.reproduce.page import write_page
 from flytune.reproduce.points import points
 from flytune.reproduce.study import ROLES
@@ -68,3 +69,10 @@ def test_verdicts_are_plain_values(make_evidence):
         "unit": "share",
         "agrees": False,
     }
+
+
+def test_verdicts_are_written_as_tables_of_markdown(make_evidence):
+    text = markdown([VERDICT], points(make_evidence(ORDERED)))
+    assert "| R24 | a < b & <script>alert(1)</script> | **holds** | none |" in text
+    assert "| share <b> | 50.0 % [40.0 %, 60.0 %] | no |" in text
+    assert all(f"\n### C{number}\n" in text for number in range(1, 11))

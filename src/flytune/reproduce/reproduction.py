@@ -13,6 +13,7 @@ from flytune.learn.run import Progress
 from flytune.reproduce.claims import claims
 from flytune.reproduce.evidence import Evidence, gather
 from flytune.reproduce.figures import write_figures
+from flytune.reproduce.markdown import markdown
 from flytune.reproduce.page import write_page
 from flytune.reproduce.points import Point, points
 from flytune.reproduce.study import Member, Study, open_study
@@ -59,7 +60,7 @@ def reproduce(
 ) -> Reproduction:
     """Run the paper again and judge every claim; goes on from wherever the study's folder stands.
 
-    Writes `report.html`, `verdicts.json` and `figures/*.svg` into the folder, beside the runs.
+    Writes `report.html`, `verdicts.json`, `verdicts.md` and `figures/*.svg` into the folder, beside the runs.
 
     Raises:
         BadInput: the folder cannot be used.
@@ -77,14 +78,15 @@ def _write(evidence: Evidence, started: float) -> Reproduction:
     study = evidence.study
     verdicts, contradictions = claims(evidence), points(evidence)
     figures = write_figures(study.folder / "figures", evidence)
-    report, record = study.folder / "report.html", study.folder / "verdicts.json"
+    report, record, words = (study.folder / name for name in ("report.html", "verdicts.json", "verdicts.md"))
     write_page(report, evidence, verdicts, contradictions)
     result = Reproduction(
         study=study,
         verdicts=verdicts,
         points=contradictions,
-        files=[report, record, *figures],
+        files=[report, record, words, *figures],
         seconds=time.monotonic() - started,
     )
+    words.write_text(markdown(verdicts, contradictions), encoding="utf-8")
     record.write_text(json.dumps(result.to_dict(), indent=2) + "\n", encoding="utf-8")
     return result
