@@ -1,43 +1,18 @@
 """The page of a comparison: its numbers, its figures in the data and in a browser, and what it refuses."""
 
 import dataclasses
-import json
 import math
-from html.parser import HTMLParser
 
 import numpy as np
 import pytest
 from tests.chromium import DRAWN, MISPLACED, assert_quiet
+from tests.pages import HOSTILE, Reader
 
 from flytune.errors import BadInput
 from flytune.response.compare import compare
 from flytune.response.difference import METRICS
 from flytune.show import comparison_plots, comparison_tables
 from flytune.show.comparison import write_comparison
-
-HOSTILE = """<script>alert(1)</script><img src=x onerror='alert(2)'>"</script><!--&amp;%{x}"""
-
-
-class Reader(HTMLParser):
-    """Reads a page as a browser does: its elements, its text, and the data of its figures."""
-
-    def __init__(self, page):
-        super().__init__()
-        self.elements, self.text, self.figures, self._data = [], "", [], False
-        self.feed(page)
-
-    def handle_starttag(self, tag, attrs):
-        self.elements.append((tag, dict(attrs)))
-        self._data = dict(attrs).get("type") == "application/json"
-
-    def handle_endtag(self, tag):
-        self._data = False
-
-    def handle_data(self, data):
-        if self._data:
-            self.figures.append(json.loads(data))
-        elif self.elements and self.elements[-1][0] not in ("script", "style"):
-            self.text += data
 
 
 @pytest.fixture(scope="session")

@@ -1,43 +1,14 @@
 import dataclasses
 import html
-import json
-from html.parser import HTMLParser
 
 import numpy as np
 import pytest
 from tests.chromium import DRAWN, assert_quiet
+from tests.pages import HOSTILE, Reader
 
 from flytune.errors import BadInput
 from flytune.show.report import write_report
 from flytune.task.task import write_task
-
-HOSTILE = """<script>alert(1)</script><img src=x onerror='alert(2)'>"</script><!--&amp;%{x}"""
-
-
-class Reader(HTMLParser):
-    """Reads a page as a browser does: its elements, its text, and the data of its figures."""
-
-    def __init__(self, page):
-        super().__init__()
-        self.elements, self.text, self.figures, self._data = [], "", [], False
-        self.feed(page)
-
-    def handle_starttag(self, tag, attrs):
-        self.elements.append((tag, dict(attrs)))
-        self._data = dict(attrs).get("type") == "application/json"
-
-    def handle_endtag(self, tag):
-        self._data = False
-
-    def handle_data(self, data):
-        if self._data:
-            self.figures.append(json.loads(data))
-        elif self.elements and self.elements[-1][0] not in ("script", "style"):
-            self.text += data
-
-    def texts_of_figures(self):
-        """Everything that a figure writes: names of traces, titles, annotations."""
-        return json.dumps(self.figures)
 
 
 @pytest.fixture
