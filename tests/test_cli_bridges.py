@@ -43,6 +43,7 @@ def test_a_pilot_flies_the_same_starts_in_another_world(folder, world):
     assert error_there == pytest.approx(error_here, rel=0.02)  # docs/worlds.md: centimetres in a metre
 
 
+@pytest.mark.slow
 def test_an_option_of_a_world_changes_the_flight(folder):
     pytest.importorskip("pybullet", reason="needs flytune[pybullet]")
     common = ["evaluate", "pid", *SHORT, "--world", "pybullet", "--json"]

@@ -50,6 +50,7 @@ def test_a_finished_study_is_not_trained_again(done):
     assert [member.directory.stat().st_mtime for member in done.members()] == before
 
 
+@pytest.mark.slow
 def test_a_killed_worker_is_run_again_with_the_same_result(done, tmp_path):
     study = Study(folder=tmp_path / "study", seeds=1, steps=STEPS)
     open_study(study)
@@ -70,6 +71,7 @@ def test_a_killed_worker_is_run_again_with_the_same_result(done, tmp_path):
             assert (ours.directory / name).read_bytes() == (theirs.directory / name).read_bytes()
 
 
+@pytest.mark.slow
 def test_an_interrupted_study_goes_on_to_the_same_result(done, tmp_path):
     study = Study(folder=tmp_path / "study", seeds=1, steps=STEPS)
     open_study(study)
