@@ -42,8 +42,14 @@ def reward(evidence: Evidence) -> go.Figure:
     return style.frame(figure, 420, hovermode="x")
 
 
-def boxes(evidence: Evidence, flown: Flown, condition: str, unit: Callable[[str], tuple[str, float]],
-          of: Callable[[Judgement, str], np.ndarray]) -> go.Figure:  # fmt: skip
+def boxes(
+    evidence: Evidence,
+    flown: Flown,
+    condition: str,
+    unit: Callable[[str], tuple[str, float]],
+    of: Callable[[Judgement, str], np.ndarray],
+    logarithmic: bool = False,
+) -> go.Figure:
     """Boxes of one metric per axis and behaviour, over all seeds and trials, with the number of trials drawn."""
     figure = make_subplots(1, len(AXES), horizontal_spacing=0.07, subplot_titles=[heading(axis) for axis in AXES])
     for panel, axis in enumerate(AXES, start=1):
@@ -57,7 +63,8 @@ def boxes(evidence: Evidence, flown: Flown, condition: str, unit: Callable[[str]
             figure.add_trace(plots.box(finite, place, role, COLOURS[role]), row=1, col=panel)
         here: dict[str, Any] = {"row": 1, "col": panel}
         figure.update_xaxes(tickvals=list(range(len(ROLES))), ticktext=ticks, range=[-0.6, len(ROLES) - 0.4], **here)
-        figure.update_yaxes(title_text=f"[{symbol}]", rangemode="tozero", row=1, col=panel)
+        kind = {"type": "log"} if logarithmic else {"rangemode": "tozero"}
+        figure.update_yaxes(title_text=f"[{symbol}]", row=1, col=panel, **kind)
     figure.update_xaxes(showgrid=False, tickangle=0, tickfont_size=10)
     return style.frame(figure, 400, showlegend=False)
 

@@ -112,7 +112,10 @@ def _boxes(evidence: Evidence, label: str, of: Callable[[Judgement, str], np.nda
             axes.annotate(share, (place, 1.0), xycoords=("data", "axes fraction"), ha="center", va="bottom", fontsize=6)
         axes.set_xticks(range(len(ROLES)), [role[:5] + "." for role in ROLES])
         axes.set_title(axis, pad=12)
-        axes.set_ylim(bottom=0)
+        if label.startswith("steady-state"):  # from millimetres to metres
+            axes.set_yscale("log")
+        else:
+            axes.set_ylim(bottom=0)
     panels[0].set_ylabel(label)
     return figure
 

@@ -101,6 +101,12 @@ def order(evidence: Evidence, flown: Flown) -> Measured:
         )
         for role in ROLES
     ]
+    for fast, slow in FASTER:
+        pairs = _pairs(evidence, fast, slow, flown)
+        sooner = [
+            a.secondary_settling_time["5%"]["position"] < b.secondary_settling_time["5%"]["position"] for a, b in pairs
+        ]
+        aside.append(share(f"{fast} settles before {slow} within 5 % of the trial's own distance", sooner, None))
     return Measured(
         printed=rows("printed", "all trials of 10 s", feasible=False),
         reading=rows("fair", "feasible trials", feasible=True),

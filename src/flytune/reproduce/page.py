@@ -107,7 +107,12 @@ def _boxes(evidence: Evidence, condition: str) -> str:
         lambda judged, axis: judged.overshoot_raw[axis],
     )
     error = drawings.boxes(
-        evidence, "last", condition, LENGTH.__getitem__, lambda judged, axis: judged.steady_state_error[axis]
+        evidence,
+        "last",
+        condition,
+        LENGTH.__getitem__,
+        lambda judged, axis: judged.steady_state_error[axis],
+        logarithmic=True,
     )
     return (
         f"<h3>Settling time</h3>{page.drawing(settling, _CAPTIONS['settling'])}"
@@ -138,7 +143,7 @@ scale: inspection's terms add up to less.""",
     "settling": """
 Trials that settle; under each box how many these are. A low box over a small number is no success.""",
     "overshoot": "Raw: also excursions that stay inside the settling band. Small steps have none.",
-    "error": "Distance of the mean of the last two seconds from the target, on each axis.",
+    "error": "Distance of the mean of the last two seconds from the target, on each axis; the axis is logarithmic.",
     "profile": "The first five tests of the first seed, the same starts and noise for each; green is the band.",
     "motors": """
 Left, what the paper draws: every controller that hovers has the hover speed in the mean (C6). Right, what tells them
