@@ -63,7 +63,7 @@ def boxes(
             figure.add_trace(plots.box(finite, place, role, COLOURS[role]), row=1, col=panel)
         here: dict[str, Any] = {"row": 1, "col": panel}
         figure.update_xaxes(tickvals=list(range(len(ROLES))), ticktext=ticks, range=[-0.6, len(ROLES) - 0.4], **here)
-        kind = {"type": "log"} if logarithmic else {"rangemode": "tozero"}
+        kind: dict[str, Any] = {"type": "log"} if logarithmic else {"rangemode": "tozero"}
         figure.update_yaxes(title_text=f"[{symbol}]", row=1, col=panel, **kind)
     figure.update_xaxes(showgrid=False, tickangle=0, tickfont_size=10)
     return style.frame(figure, 400, showlegend=False)

@@ -67,7 +67,8 @@ def _canvas(
 
 
 def _readable(values: np.ndarray, axis: str) -> np.ndarray:
-    return np.degrees(values) if axis == "yaw" else 1e3 * values
+    """Errors in mm or deg; a logarithmic axis begins at a hundredth of either."""
+    return np.maximum(np.degrees(values) if axis == "yaw" else 1e3 * values, 0.01)
 
 
 def _reward(evidence: Evidence) -> Figure:
