@@ -103,9 +103,8 @@ def order(evidence: Evidence, flown: Flown) -> Measured:
     ]
     for fast, slow in FASTER:
         pairs = _pairs(evidence, fast, slow, flown)
-        sooner = [
-            a.secondary_settling_time["5%"]["position"] < b.secondary_settling_time["5%"]["position"] for a, b in pairs
-        ]
+        times = [[judged.secondary_settling_time["5%"]["position"] for judged in pair] for pair in pairs]
+        sooner = [(early < late) & np.isfinite(late) for early, late in times]
         aside.append(share(f"{fast} settles before {slow} within 5 % of the trial's own distance", sooner, None))
     return Measured(
         printed=rows("printed", "all trials of 10 s", feasible=False),
@@ -115,8 +114,12 @@ def order(evidence: Evidence, flown: Flown) -> Measured:
 
 
 def _sooner(first: Judgement, second: Judgement, feasible: bool) -> np.ndarray:
-    """Whether each trial of the first settles before the same trial of the second."""
-    sooner = first.settling_time["position"] < second.settling_time["position"]
+    """Whether each trial of the first settles before the same trial of the second, which settles, too.
+
+    Where one of them never settles there are no two settling times that could be in an order.
+    """
+    late = second.settling_time["position"]
+    sooner = (first.settling_time["position"] < late) & np.isfinite(late)
     return sooner[~first.infeasible & ~second.infeasible] if feasible else sooner
 
 
