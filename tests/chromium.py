@@ -53,7 +53,8 @@ MISPLACED = """
 
 
 def assert_quiet(browser: "Browser") -> None:
-    """Fail where the page has thrown, complained or asked for anything over a network."""
+    """Fail where the page has thrown, complained or asked for anything over a network; then leave the page."""
+    browser.call("Page.navigate", url="about:blank")  # figures in space would go on being drawn for other tests to wait
     for event in browser.events:
         method, told = event["method"], event.get("params", {})
         assert method not in ("Runtime.exceptionThrown", "Page.javascriptDialogOpening"), told
