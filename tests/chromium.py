@@ -53,8 +53,7 @@ MISPLACED = """
 
 
 def assert_quiet(browser: "Browser") -> None:
-    """Fail where the page has thrown, complained or asked for anything over a network; then leave the page."""
-    browser.call("Page.navigate", url="about:blank")  # figures in space would go on being drawn for other tests to wait
+    """Fail where the page has thrown, complained or asked for anything over a network."""
     for event in browser.events:
         method, told = event["method"], event.get("params", {})
         assert method not in ("Runtime.exceptionThrown", "Page.javascriptDialogOpening"), told

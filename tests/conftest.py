@@ -31,8 +31,15 @@ checker.check_functions = check_functions
 install_import_hook([f"flytune.{name}" for name in CHECKED.split(", ")], "flytune_type_checker.check_functions")
 
 
+@pytest.fixture
+def browser(chromium):
+    """A running browser, sent to an empty page afterwards: figures in space would go on being drawn."""
+    yield chromium
+    chromium.call("Page.navigate", url="about:blank")
+
+
 @pytest.fixture(scope="session")
-def browser(tmp_path_factory):
+def chromium(tmp_path_factory):
     """A running headless Chromium; skips where there is none, except in continuous integration, where it fails."""
     found = [path for name in BROWSERS if (path := shutil.which(name))] + [p for p in ON_A_MAC if Path(p).exists()]
     if not found:
