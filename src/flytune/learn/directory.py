@@ -45,7 +45,7 @@ class RunDirectory:
             raise BadInput(f"out: {path} already holds a run. Give another directory, or --resume to go on with it.")
         try:
             path.mkdir(parents=True, exist_ok=True)
-            _write_text(path / "task.toml", write_task(task))
+            write_text(path / "task.toml", write_task(task))
             self._write_facts(_facts(task, trainer, seed))
         except OSError as error:
             raise BadInput(f"out: {path} cannot be written ({error.strerror}). Give another directory.") from None
@@ -75,7 +75,7 @@ class RunDirectory:
         whole = folder / "learner.safetensors.part"
         safetensors.numpy.save_file(leaves, whole, metadata={"rows": json.dumps(rows)})
         whole.replace(folder / "learner.safetensors")
-        _write_text(self.path / "metrics.jsonl", "".join(json.dumps(row) + "\n" for row in rows))
+        write_text(self.path / "metrics.jsonl", "".join(json.dumps(row) + "\n" for row in rows))
 
     def resume(self, fresh: Any) -> tuple[Any, list[dict[str, Any]]]:
         """The learner and the metrics of the checkpoint; `fresh` says what the learner is made of."""
@@ -105,7 +105,7 @@ class RunDirectory:
         )
 
     def _write_facts(self, facts: dict[str, Any]) -> None:
-        _write_text(self.path / "run.json", json.dumps(facts, indent=2) + "\n")
+        write_text(self.path / "run.json", json.dumps(facts, indent=2) + "\n")
 
 
 def resume_command(path: Path, trainer: str, seed: int) -> str:
@@ -187,7 +187,8 @@ def _raw(leaf: Any) -> Any:
     return jax.random.key_data(leaf) if _is_key(leaf) else leaf
 
 
-def _write_text(path: Path, text: str) -> None:
+def write_text(path: Path, text: str) -> None:
+    """Write a text file, whole or not at all."""
     whole = path.with_name(path.name + ".part")
     whole.write_text(text, encoding="utf-8")
     whole.replace(path)

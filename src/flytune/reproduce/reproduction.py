@@ -9,6 +9,7 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
+from flytune.learn.directory import write_text
 from flytune.learn.run import Progress
 from flytune.reproduce.claims import claims
 from flytune.reproduce.evidence import Evidence, gather
@@ -87,6 +88,6 @@ def _write(evidence: Evidence, started: float) -> Reproduction:
         files=[report, record, words, *figures],
         seconds=time.monotonic() - started,
     )
-    words.write_text(markdown(verdicts, contradictions), encoding="utf-8")
-    record.write_text(json.dumps(result.to_dict(), indent=2) + "\n", encoding="utf-8")
+    write_text(words, markdown(verdicts, contradictions))
+    write_text(record, json.dumps(result.to_dict(), indent=2) + "\n")
     return result

@@ -10,7 +10,7 @@ from typing import Any, Literal
 from flytune import document
 from flytune.control.policy import load_policy
 from flytune.errors import BadInput
-from flytune.learn.directory import first_difference, read_facts
+from flytune.learn.directory import first_difference, read_facts, write_text
 from flytune.learn.run import with_steps
 from flytune.task.task import Task, load_task
 
@@ -98,7 +98,7 @@ def open_study(study: Study) -> None:
         raise BadInput(f"out: {study.folder} is not empty and holds no reproduction. Give another directory.")
     try:
         (study.folder / "runs").mkdir(parents=True, exist_ok=True)
-        path.write_text(json.dumps(study.plan(), indent=2) + "\n", encoding="utf-8")
+        write_text(path, json.dumps(study.plan(), indent=2) + "\n")
     except OSError as error:
         raise BadInput(f"out: {study.folder} cannot be written ({error.strerror}). Give another directory.") from None
 

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from flytune.errors import BadInput, Diverged, Interrupted
+from flytune.learn.directory import write_text
 from flytune.learn.run import Progress
 from flytune.reproduce.study import Member, Study, condition
 from flytune.task.task import write_task
@@ -47,8 +48,8 @@ def train_all(
 
     Raises:
         BadInput: a directory holds something else, or a training refused its input.
-        Diverged: the numbers of a training stopped being finite; the others were finished.
-        Interrupted: Ctrl-C; every training under way saved a checkpoint.
+        Diverged: the numbers of a training stopped being finite; those under way were finished.
+        Interrupted: Ctrl-C, every training under way saved a checkpoint; or a process was killed again and again.
     """
     conditions = [(member, condition(study, member, tell)) for member in study.members()]
     open_ones = [(member, state) for member, state in conditions if state != "done"]
@@ -84,7 +85,7 @@ def _write_tasks(study: Study) -> dict[str, Path]:
     paths = {}
     for role in {member.role for member in study.members()}:
         paths[role] = study.folder / f"{study.preset(role)}.toml"
-        paths[role].write_text(write_task(study.task(role)), encoding="utf-8")
+        write_text(paths[role], write_task(study.task(role)))
     return paths
 
 
@@ -122,10 +123,11 @@ class _Crew:
                 raise Diverged(f"{member.directory.name}: {words}")
             if code == 2:
                 raise BadInput(f"{member.directory.name}: {words}")
-            tell(f"{member.directory.name}: its process ended with {code} {words}".rstrip() + "; it goes on")
-            begun = condition(study, member, tell) == "begun"
+            ended = f"{member.directory.name}: its process ended with {code} {words}".rstrip()
             if attempt == ATTEMPTS:
-                raise Diverged(f"{member.directory.name}: its process ended {ATTEMPTS} times. See {member.directory}.")
+                raise Interrupted(f"{ended}, the {ATTEMPTS}. time. What it needs may be missing, memory for instance.")
+            tell(f"{ended}; it goes on")
+            begun = condition(study, member, tell) == "begun"
 
     def _run(
         self,
