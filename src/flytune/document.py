@@ -88,11 +88,18 @@ def plain(node: Any) -> dict[str, Any]:
 
 
 def overlay(below: Mapping[str, Any], above: Mapping[str, Any]) -> dict[str, Any]:
-    """Nested tables with those of `above` laid over them: a table adds to a table, any other value replaces."""
+    """Nested tables with those of `above` laid over them.
+
+    A table adds to a table, and replaces one of another `kind`; any other value replaces.
+    """
     result = dict(below)
     for key, value in above.items():
-        both = isinstance(value, Mapping) and isinstance(result.get(key), Mapping)
-        result[key] = overlay(result[key], value) if both else value
+        there = result.get(key)
+        result[key] = value
+        if isinstance(value, Mapping) and isinstance(there, Mapping):
+            kind = there.get("kind")
+            if value.get("kind", kind) == kind:
+                result[key] = overlay(there, value)
     return result
 
 
@@ -329,9 +336,9 @@ def _fill(table: Any, node: Any, path: tuple[str, ...], sources: Mapping[str, st
         item = tomlkit.item(value)
         notes = [_unit(hints[name], "") or ("1" if _is_number(value) else ""), allowed(hints[name])]
         notes.append(source_of(".".join((*path, name)), sources))
-        table.add(name, item)
         if name not in ("kind", "name"):
-            table[name].comment("; ".join(note for note in notes if note))
+            item.comment("; ".join(note for note in notes if note))
+        table.add(name, item)
     for name, original, value in later:
         inner = tomlkit.table()
         if dataclasses.is_dataclass(original):

@@ -10,6 +10,7 @@ import pytest
 from flytune.learn import apg
 from flytune.response.fly import fly
 from flytune.response.judge import judge
+from flytune.task.observation import input_scale
 from flytune.task.task import load_task
 
 
@@ -42,8 +43,8 @@ def test_the_barrier_costs_nothing_inside_its_margin_and_grows_as_a_square_beyon
 
 
 def test_each_block_of_the_observation_has_its_own_scale(small_task):
-    settings = dataclasses.replace(small_task.apg, input_scale=(1.0, 2.0, 3.0, 4.0, 5.0))
-    np.testing.assert_array_equal(apg.input_scale(settings), [1] * 3 + [2] * 4 + [3] * 3 + [4] * 3 + [5] * 4)
+    scale = input_scale((1.0, 2.0, 3.0, 4.0, 5.0))
+    np.testing.assert_array_equal(scale, [1] * 3 + [2] * 4 + [3] * 3 + [4] * 3 + [5] * 4)
 
 
 def test_episodes_go_on_from_update_to_update(small_task):

@@ -103,7 +103,7 @@ def our_optimiser(settings, model):
     mean, square = (
         flat(as_ours({name: moments[kind] for name, moments in memory.items()})) for kind in ("exp_avg", "exp_avg_sq")
     )
-    fresh = ppo._optimiser(settings).init(flat(as_ours(weights)))
+    fresh = ppo._optimiser(settings, as_ours(weights)).init(flat(as_ours(weights)))
 
     def filled(part):
         return part._replace(count=jnp.int32(count), mu=mean, nu=square) if hasattr(part, "mu") else part

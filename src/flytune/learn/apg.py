@@ -16,12 +16,13 @@ from jaxtyping import Array, Float
 
 from flytune import env
 from flytune.control.policy import Network, Policy, make_network
-from flytune.env import Episode
+from flytune.env import Episode, Outcome
 from flytune.learn.account import account
 from flytune.learn.optimise import averaged, descend
 from flytune.pytree import pytree
-from flytune.task.observation import BLOCKS, NOISY, SIZE
+from flytune.task.observation import NOISY, SIZE, input_scale
 from flytune.task.task import Task
+from flytune.task.termination import SAFE, cause
 from flytune.task.training import ApgSettings
 
 
@@ -39,17 +40,12 @@ class Learner:
 
 def policy(settings: ApgSettings, learner: Learner) -> Policy:
     """The policy that is flown: the averaged actor."""
-    return Policy(actor=learner.average, input_scale=input_scale(settings), squash="tanh")
+    return Policy(actor=learner.average, input_scale=input_scale(settings.input_scale), squash="tanh")
 
 
 def last_policy(settings: ApgSettings, learner: Learner) -> Policy:
     """The policy of the last update."""
-    return Policy(actor=learner.actor, input_scale=input_scale(settings), squash="tanh")
-
-
-def input_scale(settings: ApgSettings) -> Float[Array, "17"]:
-    """What each number of the observation is multiplied with, from one factor per block."""
-    return jnp.repeat(jnp.asarray(settings.input_scale), jnp.asarray(BLOCKS), total_repeat_length=SIZE)
+    return Policy(actor=learner.actor, input_scale=input_scale(settings.input_scale), squash="tanh")
 
 
 def _optimiser(settings: ApgSettings) -> optax.GradientTransformation:
@@ -83,6 +79,18 @@ def barrier(margin: Float[Array, ""], settings: ApgSettings) -> Float[Array, ""]
     return settings.barrier_weight * jnp.maximum(settings.barrier_margin - margin, 0.0) ** 2
 
 
+def forgiven(task: Task, moved: Episode, outcome: Outcome, settings: ApgSettings) -> Outcome:
+    """The outcome of a training episode, which goes on until a margin is overdrawn by more than `settings.leeway`.
+
+    Where the episode ends at the bound itself, the gradient never sees what lies beyond: the barrier is then weakest
+    just where it is needed.
+    """
+    beyond = cause({name: margin + settings.leeway for name, margin in outcome.margins.items()})
+    terminated = beyond != SAFE
+    truncated = (moved.steps >= task.horizon) & ~terminated
+    return dataclasses.replace(outcome, cause=beyond, terminated=terminated, truncated=truncated)
+
+
 @partial(jax.jit, static_argnames="settings", donate_argnames="learner")
 def update(task: Task, settings: ApgSettings, learner: Learner) -> tuple[Learner, dict[str, Any]]:
     """The learner after one update, and what it saw: reward, terms, terminations, lengths of finished episodes."""
@@ -110,11 +118,12 @@ def _loss(task: Task, settings: ApgSettings, actor: Network, episodes: Episode, 
     only the episodes between steps are kept for the gradient; what happens within a step is worked out again.
     """
     task = dataclasses.replace(task, initial_state=settings.initial_state)
-    scale = input_scale(settings)
+    scale = input_scale(settings.input_scale)
 
     def one_step(episode: Episode, action: Array, reset_key: Array) -> Any:
         moved, outcome = env.step(task, episode, action)
         cost = sum((barrier(margin, settings) for margin in outcome.margins.values()), start=jnp.zeros(()))
+        outcome = forgiven(task, moved, outcome, settings)
         return env.autoreset(task, moved, outcome, reset_key), (outcome.reward - cost, outcome, moved)
 
     step = jax.checkpoint(jax.vmap(one_step, in_axes=-1, out_axes=-1), prevent_cse=False)

@@ -6,6 +6,7 @@ would still have earned counts where its horizon cut it off, and nothing comes a
 One update, rollout and twelve epochs, is one compiled function.
 """
 
+import dataclasses
 import math
 from functools import partial
 from typing import Any
@@ -22,7 +23,7 @@ from flytune.env import Episode
 from flytune.learn.account import account
 from flytune.learn.optimise import averaged, descend
 from flytune.pytree import pytree
-from flytune.task.observation import NOISY, SIZE
+from flytune.task.observation import NOISY, SIZE, input_scale
 from flytune.task.task import Task
 from flytune.task.training import PpoSettings
 
@@ -61,12 +62,12 @@ class Batch:
 
 def policy(settings: PpoSettings, learner: Learner) -> Policy:
     """The policy that is flown: the averaged actor's mean action."""
-    return Policy(actor=learner.average, input_scale=jnp.ones(SIZE), squash="clip")
+    return Policy(actor=learner.average, input_scale=input_scale(settings.input_scale), squash="clip")
 
 
 def last_policy(settings: PpoSettings, learner: Learner) -> Policy:
     """The policy of the last update, the paper's as printed."""
-    return Policy(actor=learner.parameters.actor, input_scale=jnp.ones(SIZE), squash="clip")
+    return Policy(actor=learner.parameters.actor, input_scale=input_scale(settings.input_scale), squash="clip")
 
 
 @partial(jax.jit, static_argnames="settings")
@@ -82,7 +83,7 @@ def start(task: Task, settings: PpoSettings, key: Array) -> Learner:
     return Learner(
         parameters=parameters,
         average=parameters.actor,
-        optimiser=_optimiser(settings).init(ravel_pytree(parameters)[0]),
+        optimiser=_optimiser(settings, parameters).init(ravel_pytree(parameters)[0]),
         episodes=jax.vmap(partial(env.reset, task), out_axes=-1)(keys),
         key=key,
         updates=jnp.zeros((), jnp.int32),
@@ -118,7 +119,8 @@ def rollout(
     noise = jax.random.normal(noise_key, (steps + 1, NOISY, width))
     draws = jax.random.normal(action_key, (steps, width, 4))
     reset_keys = jax.random.split(reset_key, (steps, width))
-    look = jax.vmap(partial(env.look, task), in_axes=-1, out_axes=0)
+    factor = input_scale(settings.input_scale)
+    look = jax.vmap(lambda episode, normal: env.look(task, episode, normal) * factor, in_axes=-1, out_axes=0)
 
     def advance(episodes: Episode, now: Any) -> Any:
         noise_now, noise_next, draw, reset_keys = now
@@ -197,6 +199,7 @@ def learn(
     samples = batch.action.shape[0]
     # one vector, so that clipping and Adam are a few long loops and not many short ones
     flat, restore = ravel_pytree(parameters)
+    method = _optimiser(settings, parameters)
     # one matrix, so that shuffling is one gather
     columns = jnp.concatenate(
         [
@@ -221,7 +224,7 @@ def learn(
             target=rows[:, SIZE + 6],
         )
         gradient, losses = jax.grad(lambda flat: loss(settings, restore(flat), part), has_aux=True)(flat)
-        return descend(_optimiser(settings), gradient, optimiser, flat), losses
+        return descend(method, gradient, optimiser, flat), losses
 
     keys = jax.random.split(key, settings.epochs)
     (flat, optimiser), losses = jax.lax.scan(epoch, (flat, optimiser), keys)
@@ -264,5 +267,30 @@ def loss(settings: PpoSettings, parameters: Parameters, batch: Batch) -> tuple[A
     return total, parts
 
 
-def _optimiser(settings: PpoSettings) -> optax.GradientTransformation:
-    return optax.chain(optax.clip_by_global_norm(settings.gradient_norm), optax.adam(settings.learning_rate, eps=1e-5))
+def _optimiser(settings: PpoSettings, parameters: Parameters) -> optax.GradientTransformation:
+    """What makes a step of a gradient, both as one vector."""
+    rate: Any = settings.learning_rate
+    if settings.final_learning_rate < 1:
+        minibatches = settings.environments * settings.rollout // settings.minibatch
+        total = settings.updates * settings.epochs * minibatches
+        rate = optax.linear_schedule(rate, rate * settings.final_learning_rate, total)
+    return optax.chain(_clipping(settings, parameters), optax.adam(rate, eps=1e-5))
+
+
+def _clipping(settings: PpoSettings, parameters: Parameters) -> optax.GradientTransformation:
+    """Gradients no longer than `gradient_norm`: as a whole, or the critic's and the rest each for itself."""
+    if not settings.clip_apart:
+        return optax.clip_by_global_norm(settings.gradient_norm)
+    theirs = jax.tree.map(jnp.zeros_like, parameters)
+    theirs = dataclasses.replace(theirs, critic=jax.tree.map(jnp.ones_like, parameters.critic))
+    is_critic = ravel_pytree(theirs)[0]
+
+    def clip(gradient: Any, parameters: Any = None) -> Any:
+        squares = gradient**2
+        critic = jnp.sum(squares * is_critic)
+        actor = jnp.sum(squares * (1 - is_critic))
+        longest = settings.gradient_norm
+        shrink = [jnp.minimum(1.0, longest / jnp.sqrt(jnp.maximum(part, 1e-30))) for part in (critic, actor)]
+        return gradient * (is_critic * shrink[0] + (1 - is_critic) * shrink[1])
+
+    return optax.stateless(clip)

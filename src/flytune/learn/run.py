@@ -130,7 +130,7 @@ def total_updates(task: Task, trainer: str) -> int:
     """How many updates a training takes."""
     if trainer == "apg":
         return task.apg.updates
-    return math.ceil(task.ppo.steps / steps_per_update(task, trainer))
+    return task.ppo.updates
 
 
 def steps_per_update(task: Task, trainer: str) -> int:

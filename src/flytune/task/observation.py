@@ -1,8 +1,10 @@
 """The 17 numbers a pilot sees, and their noise (paper R7, R8)."""
 
+from collections.abc import Sequence
 from typing import Annotated
 
 import jax
+import jax.numpy as jnp
 from annotated_types import Ge, Unit
 from jaxtyping import Array, Float
 
@@ -56,6 +58,11 @@ def observe(
     velocity = add(state.velocity, scale(noise.velocity, numbers[7:10]))
     body_rate = add(state.body_rate, scale(noise.body_rate, numbers[10:]))
     return pack((*position, *attitude, *velocity, *body_rate, *unpack(last_action)))
+
+
+def input_scale(factors: Sequence[float]) -> Float[Array, "17"]:
+    """What each number of the observation is multiplied with for a network, from one factor per block."""
+    return jnp.repeat(jnp.asarray(factors), jnp.asarray(BLOCKS), total_repeat_length=SIZE)
 
 
 def draw_noise(key: jax.Array) -> Float[Array, "13"]:

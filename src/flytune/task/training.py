@@ -30,6 +30,9 @@ class PpoSettings:
     value_weight: Annotated[Real, Ge(0), Unit("1")] = 0.5
     entropy_weight: Annotated[Real, Ge(0), Unit("1")] = 0.0
     gradient_norm: Annotated[Real, Gt(0), Unit("1")] = 0.5
+    clip_apart: bool = False  # actor and critic each get their own gradient_norm, so that neither drowns the other
+    final_learning_rate: Share = 1.0  # as a share of the first, reached along a line
+    input_scale: tuple[Positive, Positive, Positive, Positive, Positive] = (1.0, 1.0, 1.0, 1.0, 1.0)  # per block of R7
     initial_log_std: Annotated[Real, Unit("1")] = 0.0
     hidden: tuple[Count, ...] = (64, 64)  # R16
     average: Annotated[Real, Ge(0), Lt(1), Unit("1 per update")] = 0.95  # weights kept from before, flown policy
@@ -42,6 +45,11 @@ class PpoSettings:
                 f"minibatch: {self.minibatch} does not divide environments * rollout = {samples}. Allowed: a divisor."
             )
         return None
+
+    @property
+    def updates(self) -> int:
+        """How many updates the steps make."""
+        return math.ceil(self.steps / (self.environments * self.rollout))
 
 
 @pytree
@@ -67,6 +75,7 @@ class ApgSettings:
     gradient_norm: Annotated[Real, Gt(0), Unit("1")] = 1.0
     barrier_weight: Annotated[Real, Ge(0), Unit("1")] = 30.0
     barrier_margin: Annotated[Real, Ge(0), Lt(1), Unit("1")] = 0.1  # the barrier begins where less than this is left
+    leeway: Annotated[Real, Ge(0), Unit("1")] = 0.0  # an episode goes on until a bound is passed by this share of it
     input_scale: tuple[Positive, Positive, Positive, Positive, Positive] = (2.0, 3.0, 2.0, 0.3, 1.0)  # per block of R7
     hidden: tuple[Count, ...] = (64, 64)
     average: Annotated[Real, Ge(0), Lt(1), Unit("1 per update")] = 0.95
