@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from flytune import env
 from flytune.learn import apg
 from flytune.response.fly import fly
 from flytune.response.judge import judge
@@ -40,6 +41,32 @@ def test_the_barrier_costs_nothing_inside_its_margin_and_grows_as_a_square_beyon
     costs = [float(apg.barrier(jnp.asarray(margin), settings)) for margin in (0.5, 0.1, 0.0, -0.1)]
     # 30 * 0.1^2 = 0.3 at the bound, 30 * 0.2^2 = 1.2 as far beyond
     np.testing.assert_allclose(costs, [0.0, 0.0, 0.3, 1.2], atol=1e-6)
+
+
+def flying(speed):
+    return jnp.asarray(speed, jnp.float32), jnp.zeros(()), jnp.zeros(())
+
+
+@pytest.mark.parametrize(("leeway", "over"), [(0.0, True), (0.3, True), (0.6, False)])
+def test_an_episode_goes_on_until_a_bound_is_passed_by_the_leeway(small_task, leeway, over):
+    # 1.5 times as fast as allowed: a margin of -0.5
+    episode = env.reset(small_task, jax.random.key(0))
+    fast = dataclasses.replace(episode.state, velocity=flying(1.5 * small_task.speed_bound))
+    moved, outcome = env.step(small_task, dataclasses.replace(episode, state=fast), jnp.zeros(4))
+    assert bool(outcome.terminated)
+    settings = dataclasses.replace(small_task.apg, leeway=leeway)
+    assert bool(apg.forgiven(small_task, moved, outcome, settings).terminated) is over
+
+
+def test_an_episode_within_the_leeway_still_ends_at_its_horizon(small_task):
+    episode = env.reset(small_task, jax.random.key(0))
+    fast = dataclasses.replace(episode.state, velocity=flying(1.2 * small_task.speed_bound))
+    last = dataclasses.replace(episode, state=fast, steps=jnp.asarray(small_task.horizon - 1))
+    moved, outcome = env.step(small_task, last, jnp.zeros(4))
+    assert not bool(outcome.truncated)
+    outcome = apg.forgiven(small_task, moved, outcome, dataclasses.replace(small_task.apg, leeway=0.5))
+    assert bool(outcome.truncated)
+    assert not bool(outcome.terminated)
 
 
 def test_each_block_of_the_observation_has_its_own_scale(small_task):

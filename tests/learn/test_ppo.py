@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax.flatten_util import ravel_pytree
 from scipy import stats
 
 from flytune.learn import ppo
@@ -110,6 +111,53 @@ def test_clipping_takes_the_gradient_from_samples_that_have_moved_far_enough(sma
     for first, second in zip(jax.tree.leaves(gradient.actor), jax.tree.leaves(again.actor), strict=True):
         np.testing.assert_allclose(first, second, atol=1e-6)
     assert any(np.abs(leaf).max() > 1e-3 for leaf in jax.tree.leaves(gradient.actor))
+
+
+@pytest.mark.parametrize("apart", [False, True])
+def test_gradients_are_clipped_as_a_whole_or_apart(small_task, apart):
+    settings = dataclasses.replace(small_task.ppo, clip_apart=apart, gradient_norm=0.5)
+    parameters = ppo.start(small_task, settings, jax.random.key(0)).parameters
+    actor = jax.tree.map(lambda leaf: 0.1 * jnp.ones_like(leaf), parameters)
+    gradient = dataclasses.replace(actor, critic=jax.tree.map(lambda leaf: 10 * jnp.ones_like(leaf), parameters.critic))
+    flat, restore = ravel_pytree(gradient)
+    method = ppo._clipping(settings, parameters)
+    clipped = restore(method.update(flat, method.init(flat))[0])
+    norm = {name: float(jnp.linalg.norm(ravel_pytree(getattr(clipped, name))[0])) for name in ("actor", "critic")}
+    assert norm["critic"] == pytest.approx(0.5, rel=1e-3)
+    if apart:
+        assert float(clipped.log_std[0] / clipped.actor.weights[0][0, 0]) == pytest.approx(1)
+        assert norm["actor"] == pytest.approx(0.5, rel=0.01)  # the standard deviations have the rest
+    else:
+        before = ravel_pytree(gradient.actor)[0], ravel_pytree(gradient.critic)[0]
+        ratio = jnp.linalg.norm(before[0]) / jnp.linalg.norm(before[1])
+        assert norm["actor"] == pytest.approx(float(ratio) * norm["critic"], rel=1e-3)
+
+
+def test_the_learning_rate_falls_along_a_line_to_its_last_share(small_task):
+    # one update of two minibatches and one epoch: steps of Adam on a constant gradient are as long as the rate
+    settings = dataclasses.replace(
+        small_task.ppo, steps=64, environments=8, rollout=8, minibatch=32, epochs=1, final_learning_rate=0.2
+    )
+    parameters = ppo.start(small_task, settings, jax.random.key(0)).parameters
+    method = ppo._optimiser(settings, parameters)
+    gradient = jnp.ones_like(ravel_pytree(parameters)[0])
+    state, lengths = method.init(gradient), []
+    for _ in range(4):
+        step, state = method.update(gradient, state)
+        lengths.append(float(-step[0]) / settings.learning_rate)
+    np.testing.assert_allclose(lengths, [1.0, 0.6, 0.2, 0.2], rtol=0.01)
+
+
+def test_the_policy_multiplies_what_it_sees_with_what_it_was_trained_on(small_task):
+    settings = dataclasses.replace(small_task.ppo, input_scale=(2.0, 3.0, 4.0, 5.0, 6.0))
+    learner = ppo.start(small_task, settings, jax.random.key(0))
+    plain, scaled = (
+        ppo.rollout(small_task, each, learner.parameters, learner.episodes, jax.random.key(1))[1]
+        for each in (small_task.ppo, settings)
+    )
+    factors = np.repeat([2.0, 3.0, 4.0, 5.0, 6.0], [3, 4, 3, 3, 4])
+    np.testing.assert_allclose(scaled.observation[0], factors * plain.observation[0], rtol=1e-6)
+    np.testing.assert_array_equal(ppo.policy(settings, learner).input_scale, factors)
 
 
 def test_the_rollout_stores_what_was_seen_and_done_with_the_probability_it_had(small_task):

@@ -164,3 +164,18 @@ def test_a_resumed_run_of_another_trainer_is_refused(task, tmp_path):
     train(with_steps(task, "sb3", 64), "sb3", out=tmp_path / "run")
     with pytest.raises(BadInput, match="sb3"):
         train(with_steps(task, "ppo", 64), "ppo", out=tmp_path / "run", resume=True)
+
+
+@pytest.mark.parametrize(
+    ("edit", "said"),
+    [
+        ({"clip_apart": True}, r"ppo\.clip_apart: true is not allowed.*Allowed: false\."),
+        ({"final_learning_rate": 0.5}, r"ppo\.final_learning_rate: 0\.5 is not allowed.*Allowed: 1\.0\."),
+        ({"input_scale": (2.0, 1.0, 1.0, 1.0, 1.0)}, r"ppo\.input_scale: \[2\.0, 1\.0.*Allowed: \[1\.0, 1\.0"),
+    ],
+)
+def test_what_only_our_own_ppo_can_do_is_refused_before_anything_is_written(task, tmp_path, edit, said):
+    asked = dataclasses.replace(task, ppo=dataclasses.replace(task.ppo, **edit))
+    with pytest.raises(BadInput, match=said):
+        train(asked, "sb3", out=tmp_path / "run")
+    assert not (tmp_path / "run").exists()

@@ -70,6 +70,15 @@ def test_an_edit_replaces_one_value_and_leaves_the_original_alone():
     assert data == {"a": {"b": 1, "c": [2, 3]}, "d": 4}
 
 
+def test_a_table_laid_over_one_of_another_kind_replaces_it():
+    below = {"height": {"kind": "plain", "weight": 1, "sharpness": 2}, "speed": {"kind": "plain", "weight": 3}}
+    above = {"height": {"kind": "dual", "wide": 4}, "speed": {"kind": "plain", "sharpness": 5}}
+    assert document.overlay(below, above) == {
+        "height": {"kind": "dual", "wide": 4},
+        "speed": {"kind": "plain", "weight": 3, "sharpness": 5},
+    }
+
+
 def test_an_edit_through_a_value_is_refused():
     with pytest.raises(BadInput, match=r"^a\.b\.c: a\.b is a value, not a table\.$"):
         document.edit({"a": {"b": 1}}, "a.b.c", 2)
@@ -110,6 +119,17 @@ def test_a_document_is_read_back_exactly():
     text = document.write(CAR)
     assert document.read(Car, tomllib.loads(text)) == CAR
     assert document.read(Car, document.plain(CAR)) == CAR
+
+
+@pytest.mark.parametrize("locked", [True, False])
+def test_a_yes_or_no_is_written_and_read_back(locked):
+    @pytree
+    class Door:
+        locked: bool
+
+    text = document.write(Door(locked=locked))
+    assert f"locked = {str(locked).lower()} # true or false" in text
+    assert document.read(Door, tomllib.loads(text)).locked is locked
 
 
 @settings(max_examples=100, deadline=None)

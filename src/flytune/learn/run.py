@@ -89,6 +89,7 @@ def train(
         raise BadInput(f"seed: {seed} is not allowed. Allowed: a whole number, 0 to {2**32 - 1}.")
     if trainer == "sb3":
         sb3.check_installed()
+        sb3.check_settings(task.ppo)
     if tensorboard:
         check_tensorboard()
         if out is None:
