@@ -17,6 +17,7 @@ from jaxtyping import Array, Float
 from flytune import env
 from flytune.control.policy import Network, Policy, make_network
 from flytune.env import Episode, Outcome
+from flytune.errors import BadInput
 from flytune.learn.account import account
 from flytune.learn.optimise import averaged, descend
 from flytune.pytree import pytree
@@ -89,6 +90,25 @@ def forgiven(task: Task, moved: Episode, outcome: Outcome, settings: ApgSettings
     terminated = beyond != SAFE
     truncated = (moved.steps >= task.horizon) & ~terminated
     return dataclasses.replace(outcome, cause=beyond, terminated=terminated, truncated=truncated)
+
+
+def go_on_from(settings: ApgSettings, learner: Learner, initial: Policy) -> Learner:
+    """A learner before its first update whose actor flies as `initial` does, which saw other multiples of the inputs.
+
+    Raises:
+        BadInput: `initial` has other layers, or another squash.
+    """
+    shapes, wanted = ([weight.shape for weight in each.weights] for each in (initial.actor, learner.actor))
+    if shapes != wanted or initial.squash != "tanh":
+        raise BadInput(
+            f"initial: a policy with layers {shapes} and squash {initial.squash} cannot be gone on from. "
+            f"Allowed: layers {wanted} and squash tanh, as trainer apg makes them."
+        )
+    first, *others = initial.actor.weights
+    ratio = initial.input_scale / input_scale(settings.input_scale)
+    actor = dataclasses.replace(initial.actor, weights=(first * ratio[:, None], *others))
+    actor = jax.tree.map(jnp.array, actor)  # copies: an update gives its learner's memory away
+    return dataclasses.replace(learner, actor=actor, average=jax.tree.map(jnp.array, actor))
 
 
 @partial(jax.jit, static_argnames="settings", donate_argnames="learner")

@@ -60,6 +60,7 @@ def train(
     seed: int = 0,
     out: Path | None = None,
     resume: bool = False,
+    initial: Policy | None = None,
     tensorboard: bool = False,
     on_progress: Callable[[Progress], None] | None = None,
 ) -> Run:
@@ -75,6 +76,7 @@ def train(
         seed: of the weights, the episodes and the noise; 0 or more.
         out: run directory to write; nothing is written where None.
         resume: go on from the checkpoint in `out`.
+        initial: a policy to go on from, with trainer `apg`; new weights where None.
         tensorboard: write TensorBoard's event files beside the metrics in `out`.
         on_progress: called after every update.
 
@@ -87,6 +89,8 @@ def train(
         raise BadInput(f"trainer: {trainer!r} is not allowed. Allowed: {', '.join(TRAINERS)}.")
     if not 0 <= seed < 2**32:
         raise BadInput(f"seed: {seed} is not allowed. Allowed: a whole number, 0 to {2**32 - 1}.")
+    if initial is not None and trainer != "apg":
+        raise BadInput(f"initial: trainer {trainer} cannot go on from a policy. Allowed: trainer apg.")
     if trainer == "sb3":
         sb3.check_installed()
         sb3.check_settings(task.ppo)
@@ -100,6 +104,8 @@ def train(
     with _deferred_interrupt() as interrupted:
         directory = RunDirectory(out, task, trainer, seed, resume) if out is not None else None
         learner = teacher.start(task, settings, jax.random.key(seed))
+        if initial is not None:
+            learner = apg.go_on_from(task.apg, learner, initial)
         if directory is not None and resume:
             learner, rows = directory.resume(learner)
         clock = _Clock(task, trainer, seed, rows)
