@@ -8,13 +8,13 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NoReturn
 
-from flytune.errors import BadInput, FlytuneError
+from flytune.errors import BadInput, FlytuneError, Unmet
 
 SINGLE_THREADED = "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1"
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """The exit code of one command: 0 done, 2 bad input, 3 diverged, 130 interrupted."""
+    """The exit code of one command: 0 done, 2 bad input, 3 diverged, 4 requirement not met, 130 interrupted."""
     _prepare_jax()
     try:
         options = _parser().parse_args(arguments)
@@ -53,11 +53,12 @@ def _parser() -> argparse.ArgumentParser:
     parser = _Parser(
         prog="flytune",
         description="Ask for a step response, get a trained quadrotor controller, and see how it flies.",
-        epilog="Start with: flytune train baseline. Exit codes: 0 done, 2 bad input, 3 diverged, 130 interrupted.",
+        epilog="Start with: flytune train baseline. Exit codes: 0 done, 2 bad input, 3 diverged, "
+        "4 tune could not meet the requirement, 130 interrupted.",
     )
     commands = parser.add_subparsers(dest="command", metavar="COMMAND", required=True)
-    for add in (_add_train, _add_evaluate, _add_compare, _add_report, _add_reproduce,
-                _add_export, _add_show, _add_bench):  # fmt: skip
+    for add in (_add_train, _add_evaluate, _add_compare, _add_report, _add_tune,
+                _add_rules, _add_reproduce, _add_export, _add_show, _add_bench):  # fmt: skip
         add(commands)
     return parser
 
@@ -70,10 +71,10 @@ def _command(commands: Any, name: str, run: Callable[[argparse.Namespace], None]
     return command
 
 
-TASK_HELP = "a preset (baseline, acrobatic, inspection) or a TOML file"
+TASK_HELP = "a preset (baseline, acrobatic, inspection, or one of them -refined) or a TOML file"
 WHO_HELP = (
-    "a run directory, a policy (.safetensors, .onnx, or a .zip of Stable-Baselines3), or pid, geometric, lqr "
-    "(add @textbook for gains that were not tuned)"
+    "a run directory, a policy (.safetensors, .onnx, or a .zip of Stable-Baselines3), a policy that ships "
+    "(baseline-refined, or baseline-refined@ppo), or pid, geometric, lqr (add @textbook for gains that were not tuned)"
 )
 WORLDS = ("flytune", "pybullet", "mujoco")
 
@@ -152,6 +153,86 @@ def _add_reproduce(commands: Any) -> None:
     command.add_argument("--out", type=Path, default=argparse.SUPPRESS, metavar="DIR",
                          help="where runs, figures, verdicts and the page go; what is there is gone on with "
                          "(default: runs/reproduction-TRAINER)")  # fmt: skip
+    command.add_argument("--json", action="store_true", help="print one JSON object instead of the table")
+
+
+def _add_tune(commands: Any) -> None:
+    command = _command(
+        commands, "tune", _tune, "ask for a step response: edit the task by rules and train, until it flies like that"
+    )
+    command.add_argument(
+        "task",
+        metavar="TASK",
+        nargs="?",
+        default=argparse.SUPPRESS,
+        help="where to begin, a preset or a TOML file (default: the known task that settles nearest)",
+    )
+    command.add_argument(
+        "--settling-time",
+        type=float,
+        required=True,
+        metavar="S",
+        help="wanted, in seconds: the median over trials of what the position takes",
+    )
+    command.add_argument("--at-most", action="store_true", help="the settling time is an upper bound, not a target")
+    command.add_argument(
+        "--tolerance", type=float, default=10.0, metavar="PCT", help="of a target, in percent of the settling time"
+    )
+    command.add_argument(
+        "--overshoot", type=float, default=5.0, metavar="PCT", help="at most, in percent of the step, median"
+    )
+    command.add_argument(
+        "--error",
+        type=float,
+        default=argparse.SUPPRESS,
+        metavar="M",
+        help="steady-state error at most, in metres, median (default: 0.01; yaw: in degrees, 1)",
+    )
+    command.add_argument(
+        "--axis", choices=("position", "x", "y", "z", "yaw"), default="position", help="whose response"
+    )
+    command.add_argument(
+        "--percentile", type=float, default=50.0, metavar="PCT", help="of the trials, for the settling time"
+    )
+    command.add_argument(
+        "--set",
+        nargs="+",
+        action="extend",
+        default=[],
+        metavar="PATH=VALUE",
+        dest="edits",
+        help="fix a field of the task: the tuner leaves it alone, and keeps a bound that is set here",
+    )
+    command.add_argument(
+        "--rules",
+        type=Path,
+        default=argparse.SUPPRESS,
+        metavar="FILE.toml",
+        help="rules of your own, beside those that `flytune rules` prints",
+    )
+    command.add_argument(
+        "--trainer",
+        choices=("apg", "ppo"),
+        default="apg",
+        help="how to learn; apg goes on from the last policy, ppo begins anew",
+    )
+    command.add_argument("--steps", type=int, default=12, metavar="N", help="edits at most")
+    command.add_argument("--seed", type=int, default=0, help="of the trainings")
+    command.add_argument(
+        "--out",
+        type=Path,
+        default=argparse.SUPPRESS,
+        metavar="DIR",
+        help="run directory (default: a new one under runs/)",
+    )
+    command.add_argument("--resume", action="store_true", help="go on with the tuning in --out")
+
+
+def _add_rules(commands: Any) -> None:
+    command = _command(commands, "rules", _rules, "print the heuristics of the tuner as a table")
+    command.add_argument(
+        "--rules", type=Path, default=argparse.SUPPRESS, metavar="FILE.toml", help="rules of your own, beside flytune's"
+    )
     command.add_argument("--json", action="store_true", help="print one JSON object instead of the table")
 
 
@@ -283,6 +364,40 @@ def _fly(pilot: Any, options: argparse.Namespace) -> Any:
         world=options.world,
         world_options=dict(map(document.parse_assignment, options.world_edits)),
     )
+
+
+def _tune(options: argparse.Namespace) -> None:
+    from flytune import document
+    from flytune.learn.progress import show_progress
+    from flytune.show.tuning import write_tuning
+    from flytune.tune.requirement import make_requirement
+    from flytune.tune.rules import load_rules
+    from flytune.tune.search import new_tuning_directory, tune
+
+    requirement = make_requirement(
+        options.settling_time, options.overshoot, getattr(options, "error", None), at_most=options.at_most,
+        tolerance=options.tolerance, axis=options.axis, percentile=options.percentile,
+    )  # fmt: skip
+    rules = load_rules(getattr(options, "rules", None))
+    if options.resume and "out" not in options:
+        raise BadInput("resume: needs --out DIR, the tuning to go on with.")
+    out = options.out if "out" in options else new_tuning_directory(requirement)
+    with show_progress() as on_progress:
+        result = tune(requirement, rules, out, task=getattr(options, "task", None),
+                      edits=dict(map(document.parse_assignment, options.edits)), seed=options.seed,
+                      trainer=options.trainer, most_steps=options.steps, resume=options.resume,
+                      tell=lambda line: print(line, flush=True), on_progress=on_progress)  # fmt: skip
+    write_tuning(out / "report.html", result.to_dict())
+    print(out)
+    if not result.met:
+        raise Unmet(result.why())
+
+
+def _rules(options: argparse.Namespace) -> None:
+    from flytune.tune.rules import load_rules, rules_table, to_dicts
+
+    rules = load_rules(getattr(options, "rules", None))
+    print(json.dumps({"schema": 1, "rules": to_dicts(rules)}) if options.json else rules_table(rules))
 
 
 def _reproduce(options: argparse.Namespace) -> None:

@@ -19,6 +19,12 @@ class Diverged(FlytuneError, ArithmeticError):
     exit_code = 3
 
 
+class Unmet(FlytuneError):
+    """A tuning ended without meeting its requirement; the text says what is missing and why nothing could help."""
+
+    exit_code = 4
+
+
 class Interrupted(FlytuneError):
     """The user stopped a training; the text names the checkpoint that was saved."""
 

@@ -1,0 +1,166 @@
+"""What each knob of a task really does to the response: the effect map that the tuner reads.
+
+    python benchmarks/effect_map.py --out effect-map    # trains what is missing there, then writes the package's data
+    python benchmarks/effect_map.py --docs              # draws docs/heuristics/ from it
+
+One knob of baseline-refined at a time, five values, three seeds, the analytic policy gradient from new weights. The
+unchanged task is trained once per seed and stands in the curve of every knob. Processes side by side, one per core.
+"""
+
+import argparse
+import json
+import multiprocessing
+import os
+import platform
+import time
+from importlib import metadata
+from pathlib import Path
+
+BASE = "baseline-refined"
+TRIALS, DURATION, SEED = 100, 20.0, 2000  # of the judgement
+KNOBS = {
+    "reward.survival.reward": (0.0, 0.02, 0.05, 0.1, 0.3),
+    "reward.horizontal.wide": (0.125, 0.25, 0.5, 1.0, 4.0),
+    "reward.horizontal.share": (0.2, 0.4, 0.6, 0.8, 0.95),
+    "reward.horizontal.narrow": (5.0, 10.0, 20.0, 60.0, 150.0),
+    "reward.vertical.sharpness": (1.0, 2.0, 4.0, 8.0, 16.0),
+    "reward.velocity.weight": (0.025, 0.05, 0.1, 0.2, 0.4),
+    "reward.velocity.sharpness": (0.25, 0.5, 1.0, 2.0, 4.0),
+    "reward.attitude.weight": (0.04, 0.08, 0.15, 0.3, 0.6),
+    "reward.smoothness.weight": (0.02, 0.05, 0.1, 0.3, 1.0),
+    "termination.speed.bound": (0.3, 0.5, 0.8, 1.2, 2.0),
+    "termination.body_rate.bound_deg_per_s": (115.0, 230.0, 530.0, 1000.0, 2000.0),
+}
+HERE = Path(__file__).parents[1]
+DATA = HERE / "src" / "flytune" / "tune" / "effects.json"
+DOCS = HERE / "docs" / "heuristics"
+
+
+def jobs(seeds: int) -> list[tuple[str | None, float | None, int]]:
+    """Every training: knob, value, seed; the unchanged task once per seed."""
+    from flytune.document import plain
+    from flytune.task.task import load_task
+    from flytune.tune.rules import field_of
+
+    tables = plain(load_task(BASE))
+    changed = [
+        (knob, value, seed)
+        for knob, values in KNOBS.items()
+        for value in values
+        for seed in range(seeds)
+        if value != field_of(tables, knob)
+    ]
+    return [(None, None, seed) for seed in range(seeds)] + changed
+
+
+def file_of(folder: Path, job: tuple[str | None, float | None, int]) -> Path:
+    """Where the judgement of a training is kept."""
+    knob, value, seed = job
+    return folder / f"{knob or 'baseline'}-{'' if value is None else f'{value:g}'}-s{seed}.json"
+
+
+def fly_one(folder: Path, updates: int, job: tuple[str | None, float | None, int]) -> None:
+    """Train one task and write down how it flies."""
+    from flytune.errors import Diverged
+    from flytune.learn.run import train
+    from flytune.response.fly import fly
+    from flytune.response.judge import AXES, judge
+    from flytune.task.task import load_task
+
+    knob, value, seed = job
+    task = load_task(BASE, {"apg.updates": updates, **({} if knob is None else {knob: value})})
+    began = time.monotonic()
+    row = {"seed": seed, "settled": 0, "settling_time": None, "overshoot": None, "error": None}
+    try:
+        told = judge(fly(train(task, seed=seed).policy, task, trials=TRIALS, seed=SEED, duration=DURATION)).to_dict()
+        position, axes = told["position"], told["axes"]
+        row |= {
+            "settled": position["settled"],
+            "settling_time": position["settling_time"]["median"],
+            "overshoot": position["overshoot"]["median"],
+            "error": position["steady_state_error"]["median"],
+            "settling_time_axes": {axis: axes[axis]["settling_time"]["median"] for axis in AXES},
+            "overshoot_axes": {axis: axes[axis]["overshoot"]["median"] for axis in AXES},
+            "yaw_error": axes["yaw"]["steady_state_error"]["median"],
+            "violations": told["violations"],
+            "crashed": told["crashed"],
+        }
+    except Diverged as error:
+        row["diverged"] = str(error)
+    path = file_of(folder, job)
+    whole = path.with_suffix(".part")
+    whole.write_text(json.dumps(row), encoding="utf-8")
+    whole.replace(path)
+    print(
+        f"{path.stem}: {row['settled']} settled, {row['settling_time']} s ({time.monotonic() - began:.0f} s)",
+        flush=True,
+    )
+
+
+def measure(folder: Path, updates: int, seeds: int, workers: int) -> None:
+    """Train what is missing, and put all together."""
+    folder.mkdir(parents=True, exist_ok=True)
+    plan = folder / "plan.json"
+    asked = {"updates": updates, "base": BASE}
+    if plan.exists() and json.loads(plan.read_text(encoding="utf-8")) != asked:
+        raise SystemExit(f"{folder}: holds a map of other trainings. Give another folder.")
+    plan.write_text(json.dumps(asked), encoding="utf-8")
+    missing = [(folder, updates, job) for job in jobs(seeds) if not file_of(folder, job).exists()]
+    if missing:
+        with multiprocessing.get_context("spawn").Pool(workers) as pool:
+            pool.starmap(fly_one, missing, chunksize=1)
+
+    from flytune.document import plain
+    from flytune.task.task import load_task
+    from flytune.tune.rules import field_of
+
+    tables = plain(load_task(BASE))
+
+    def rows(knob: str, value: float, baseline: float) -> list[dict]:
+        unchanged = value == baseline
+        files = [file_of(folder, (None, None, s) if unchanged else (knob, value, s)) for s in range(seeds)]
+        return [json.loads(file.read_text(encoding="utf-8")) for file in files]
+
+    told = {
+        "schema": 1,
+        "command": f"python benchmarks/effect_map.py --seeds {seeds} --updates {updates}",
+        **asked,
+        "trials": TRIALS,
+        "duration": DURATION,
+        "seeds": list(range(seeds)),
+        "versions": {name: metadata.version(name) for name in ("flytune", "jax")}
+        | {"python": platform.python_version()},
+        "knobs": {
+            knob: {
+                "baseline": (baseline := field_of(tables, knob)),
+                "points": [{"value": value, "seeds": rows(knob, value, baseline)} for value in values],
+            }
+            for knob, values in KNOBS.items()
+        },
+    }
+    DATA.write_text(json.dumps(told, indent=1) + "\n", encoding="utf-8")
+    print(DATA)
+
+
+def document_it() -> None:
+    """Tables and the drawing from the measured data."""
+    from flytune.tune.effects import load_effects
+    from flytune.tune.heuristics import draw_effects, heuristics_tables
+
+    effects = load_effects()
+    DOCS.mkdir(exist_ok=True)
+    draw_effects(DOCS / "effects.svg", effects)
+    (DOCS / "tables.md").write_text(heuristics_tables(effects), encoding="utf-8")
+    print(DOCS)
+
+
+if __name__ == "__main__":
+    os.environ.setdefault("XLA_FLAGS", "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1")
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--out", type=Path, default=Path("effect-map"))
+    parser.add_argument("--updates", type=int, default=400)
+    parser.add_argument("--seeds", type=int, default=3)
+    parser.add_argument("--workers", type=int, default=os.cpu_count() or 1)
+    parser.add_argument("--docs", action="store_true", help="draw what was measured; trains nothing")
+    options = parser.parse_args()
+    document_it() if options.docs else measure(options.out, options.updates, options.seeds, options.workers)

@@ -1,0 +1,181 @@
+"""What is asked of a response, and how far a measured one is from it."""
+
+import dataclasses
+import math
+from typing import Any
+
+import numpy as np
+
+from flytune.errors import BadInput
+from flytune.response.judge import Judgement
+from flytune.response.statistics import quantile
+
+AXES = ("position", "x", "y", "z", "yaw")
+LONGEST = 60.0  # s
+MARGIN = 0.5  # what is asked on the tuning starts, as a share of the tolerance or bound that is allowed on fresh ones
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Measured:
+    """What counts of a judged response: one number per measure, +inf where too few trials have one.
+
+    Source: docs, definitions.
+    """
+
+    settling_time: float  # s, at the percentile asked for
+    overshoot: float  # fraction of the step, median
+    error: float  # m, rad for yaw; median
+    settled: float  # share of the trials
+    kept: float  # share of the trials that cross none of the bounds the user has fixed
+
+    def to_dict(self) -> dict[str, float | None]:
+        """Plain numbers, None where infinite."""
+        return {name: v if math.isfinite(v) else None for name, v in dataclasses.asdict(self).items()}
+
+    @classmethod
+    def from_dict(cls, numbers: dict[str, Any]) -> "Measured":
+        """The inverse of `to_dict`."""
+        return cls(**{name: math.inf if value is None else value for name, value in numbers.items()})
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Requirement:
+    """The response that is wanted, of one axis or of the position."""
+
+    settling_time: float  # s
+    tolerance: float = 0.1  # share of the settling time it may be off by; only above it where `at_most`
+    at_most: bool = False  # the settling time is an upper bound, not a target
+    overshoot: float = 0.05  # at most, fraction of the step, median of the trials
+    error: float = 0.01  # at most, m (rad for yaw), median of the trials
+    settled: float = 0.99  # at least, share of the trials
+    axis: str = "position"
+    percentile: float = 50.0  # of the trials, for the settling time
+
+    def latest(self) -> float:
+        """The longest settling time in s that still meets the requirement."""
+        return self.settling_time * (1.0 if self.at_most else 1.0 + self.tolerance)
+
+    def aim(self) -> float:
+        """The settling time in s to steer for."""
+        return self.settling_time * (1.0 - self.tolerance / 2 if self.at_most else 1.0)
+
+    def measure(self, judgement: Judgement, fixed: tuple[str, ...] = ()) -> Measured:
+        """The measures of a judgement; `fixed` names the terminations the user has set."""
+        crossed = [judgement.violated[name] for name in fixed if name in judgement.violated]
+        broken = np.logical_or.reduce(crossed) if crossed else np.zeros(judgement.trials, bool)
+        times = judgement.settling_time[self.axis]
+        stepped = judgement.overshoot[self.axis]
+        stepped = stepped[~np.isnan(stepped)]
+        return Measured(
+            settling_time=_quantile(times, self.percentile / 100),
+            overshoot=_quantile(stepped, 0.5) if stepped.size else 0.0,
+            error=_quantile(judgement.steady_state_error[self.axis], 0.5),
+            settled=float(np.mean(np.isfinite(times))),
+            kept=float(1 - np.mean(broken[~judgement.infeasible])) if not judgement.infeasible.all() else 1.0,
+        )
+
+    def misses(self, measured: Measured, margin: float = 1.0) -> dict[str, float]:
+        """What is missing: measure -> by how much, as a logarithm for the settling time and a share for the others.
+
+        Positive means too much, negative too little. Empty where the requirement is met. `margin` below 1 narrows the
+        tolerance and the bounds to that share, `settled` and `kept` apart.
+        """
+        found: dict[str, float] = {}
+        if measured.settled < self.settled:
+            found["settled"] = measured.settled - self.settled
+        if measured.kept < self.settled:
+            found["kept"] = measured.kept - self.settled
+        ratio = measured.settling_time / self.settling_time
+        upper = 1 - (1 - margin) * self.tolerance if self.at_most else 1 + margin * self.tolerance
+        if ratio > upper or (not self.at_most and ratio < 1 - margin * self.tolerance):
+            found["settling_time"] = math.log(measured.settling_time / self.aim())
+        if measured.overshoot > margin * self.overshoot:
+            found["overshoot"] = measured.overshoot - margin * self.overshoot
+        if measured.error > margin * self.error:
+            found["error"] = math.log(measured.error / (margin * self.error))
+        return found
+
+    def distance(self, measured: Measured) -> float:
+        """One number for how far a response is from the requirement, 0 where it is met: to find the best of several."""
+        sizes = {"settled": 30.0, "kept": 10.0, "settling_time": 1.0, "overshoot": 5.0, "error": 0.5}
+        missed = self.misses(measured)
+        return sum(sizes[name] * min(abs(size), 10.0) for name, size in missed.items())
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain numbers."""
+        return dataclasses.asdict(self)
+
+    def __str__(self) -> str:
+        degrees = self.axis == "yaw"
+        error = f"{math.degrees(self.error):.3g} deg" if degrees else f"{1e3 * self.error:.3g} mm"
+        time = (
+            f"at most {self.settling_time:g} s" if self.at_most else f"{self.settling_time:g} s +- {self.tolerance:.0%}"
+        )
+        return (
+            f"{self.axis} settles in {time} (percentile {self.percentile:g}), overshoot at most "
+            f"{100 * self.overshoot:g} %, error at most {error}, {self.settled:.0%} of the trials settled"
+        )
+
+
+def make_requirement(
+    settling_time: float,
+    overshoot: float = 5.0,
+    error: float | None = None,
+    *,
+    at_most: bool = False,
+    tolerance: float = 10.0,
+    axis: str = "position",
+    percentile: float = 50.0,
+) -> Requirement:
+    """A requirement from the numbers a user gives.
+
+    Args:
+        settling_time: s.
+        overshoot: at most, percent of the step.
+        error: steady-state error at most, m; deg for yaw. 0.01 m or 1 deg where None.
+        at_most: the settling time is an upper bound, not a target.
+        tolerance: percent of the settling time.
+        axis: position, x, y, z or yaw.
+        percentile: of the trials that the settling time is of.
+
+    Raises:
+        BadInput: a number that is not possible, or that seems to be in another unit.
+    """
+    if axis not in AXES:
+        raise BadInput(f"axis: {axis!r} is not allowed. Allowed: {', '.join(AXES)}.")
+    hint = f" Did you mean {settling_time / 1000:g} (seconds, not milliseconds)?" if settling_time >= 200 else ""
+    _check("settling-time", settling_time, 0.2, LONGEST, "s", hint)
+    if 0 < overshoot < 0.5:
+        raise BadInput(
+            f"overshoot: {overshoot:g} is not allowed. Allowed: 0, or 0.5 to 100 %. "
+            f"Did you mean {100 * overshoot:g} (percent of the step, not a fraction)?"
+        )
+    _check("overshoot", overshoot, 0.0, 100.0, "%")
+    unit, smallest, largest = ("deg", 0.02, 3.6) if axis == "yaw" else ("m", 0.0002, 0.02)
+    if error is None:
+        error = 1.0 if axis == "yaw" else 0.01
+    millimetres = axis != "yaw" and 1 <= error <= 20
+    hint = f" Did you mean {error / 1000:g} (metres, not millimetres)?" if millimetres else ""
+    hint = hint or f" Beyond {largest:g} {unit} a trial does not count as settled."
+    _check("error", error, smallest, largest, unit, hint)
+    _check("tolerance", tolerance, 2.0, 50.0, "%", f" Did you mean {100 * tolerance:g}?" if 0 < tolerance < 1 else "")
+    _check("percentile", percentile, 1.0, 99.0, "%", f" Did you mean {100 * percentile:g}?" if percentile < 1 else "")
+    return Requirement(
+        settling_time=float(settling_time),
+        tolerance=tolerance / 100,
+        at_most=at_most,
+        overshoot=overshoot / 100,
+        error=math.radians(error) if axis == "yaw" else float(error),
+        axis=axis,
+        percentile=float(percentile),
+    )
+
+
+def _quantile(values: np.ndarray, share: float) -> float:
+    found = quantile(values, share)
+    return math.inf if found is None else found
+
+
+def _check(name: str, value: float, smallest: float, largest: float, unit: str, hint: str = "") -> None:
+    if not (math.isfinite(value) and smallest <= value <= largest):
+        raise BadInput(f"{name}: {value:g} is not allowed. Allowed: {smallest:g} to {largest:g} {unit}.{hint}")

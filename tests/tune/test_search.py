@@ -1,0 +1,105 @@
+"""The closed loop, with real trainings from policies that ship: it meets what is asked, and loses nothing."""
+
+import json
+import shutil
+
+import numpy as np
+import pytest
+
+from flytune.control.policy import load_policy
+from flytune.errors import BadInput
+from flytune.learn.pilot import find_pilot
+from flytune.response.fly import fly
+from flytune.response.judge import judge
+from flytune.task.task import load_task
+from flytune.tune.requirement import make_requirement
+from flytune.tune.rules import load_rules
+from flytune.tune.search import tune
+
+RULES = load_rules()
+
+
+def test_what_a_known_policy_already_does_takes_no_training(tmp_path):
+    measured = judge(fly(*_known("baseline-refined"), trials=100, seed=3000)).to_dict()
+    time = measured["position"]["settling_time"]["median"]
+    said = []
+    result = tune(make_requirement(time), RULES, tmp_path / "t", tell=said.append)
+    assert result.met
+    assert result.best == 0
+    assert result.start == "baseline-refined"
+    assert [line.split()[0] for line in said] == ["asked", "start", "step", "fresh", "done"]
+    pilot = find_pilot(str(tmp_path / "t"))
+    assert judge(fly(pilot.controller, pilot.task, seed=7)).settled("position") == 100
+
+
+def test_what_physics_forbids_is_refused_before_anything_is_written(tmp_path):
+    with pytest.raises(BadInput, match="whoever flies"):
+        tune(make_requirement(1.0), RULES, tmp_path / "t", edits={"termination.speed.bound": 0.8})
+    assert not (tmp_path / "t").exists()
+
+
+def test_a_directory_that_holds_a_run_is_refused_and_kept(tmp_path):
+    (tmp_path / "run.json").write_text("{}")
+    with pytest.raises(BadInput, match="already holds"):
+        tune(make_requirement(3.0), RULES, tmp_path)
+    assert (tmp_path / "run.json").read_text() == "{}"
+
+
+def test_to_resume_needs_a_tuning_that_was_asked_for_the_same(tmp_path):
+    with pytest.raises(BadInput, match="holds no tuning"):
+        tune(make_requirement(3.0), RULES, tmp_path / "none", resume=True)
+    tune(make_requirement(3.4), RULES, tmp_path / "t", most_steps=1)
+    with pytest.raises(BadInput, match="another requirement"):
+        tune(make_requirement(3.0), RULES, tmp_path / "t", resume=True)
+    (tmp_path / "t" / "tune.json").write_text("{")
+    with pytest.raises(BadInput, match="damaged"):
+        tune(make_requirement(3.4), RULES, tmp_path / "t", resume=True)
+
+
+@pytest.mark.slow
+def test_a_response_twice_as_slow_is_met_and_a_resumed_tuning_is_the_same(tmp_path):
+    wanted = make_requirement(6.0)
+    said = []
+    result = tune(wanted, RULES, tmp_path / "whole", tell=said.append)
+    assert result.met, said
+    judged = result.verdicts[-1].judgement
+    assert judged["trials"] == 200
+    assert judged["position"]["settling_time"]["median"] == pytest.approx(6.0, rel=0.1)
+    assert judged["position"]["settled"] >= 198
+    # the edits are in the task that is written, with their reasons
+    task = load_task(tmp_path / "whole" / "task.toml")
+    assert 0.3 < task.speed_bound < 0.5
+    assert "H7" in task.sources["termination.speed.bound"]
+    # cut off after its first edit, it goes on to the same end
+    shutil.copytree(tmp_path / "whole", tmp_path / "cut")
+    for name in ("policy.safetensors", "task.toml"):
+        (tmp_path / "cut" / name).unlink()
+    told = json.loads((tmp_path / "cut" / "tune.json").read_text())
+    for step in told["steps"][2:]:
+        shutil.rmtree(tmp_path / "cut" / "steps" / f"{step['number']:02d}")
+    told["steps"], told["verdicts"] = told["steps"][:2], []
+    (tmp_path / "cut" / "tune.json").write_text(json.dumps(told))
+    again = tune(wanted, RULES, tmp_path / "cut", resume=True)
+    assert [step.values for step in again.steps] == [step.values for step in result.steps]
+    for one, other in zip(*(_weights(tmp_path / name) for name in ("whole", "cut")), strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
+@pytest.mark.slow
+def test_what_no_rule_can_reach_ends_with_the_best_and_the_reasons(tmp_path):
+    # every knob but one is fixed, and that one hardly matters
+    fixed = {"termination.speed.bound": 0.8, "apg.updates": 60}
+    rules = [rule for rule in RULES if rule.name == "H1 bolder"]
+    result = tune(make_requirement(2.6), rules, tmp_path / "t", task="baseline-refined", edits=fixed, most_steps=3)
+    assert not result.met
+    assert "too slow" in result.why()
+    assert (tmp_path / "t" / "policy.safetensors").exists()
+
+
+def _known(name):
+    pilot = find_pilot(name)
+    return pilot.controller, pilot.task
+
+
+def _weights(directory):
+    return load_policy(directory / "policy.safetensors").actor.weights
