@@ -3,9 +3,10 @@
     python benchmarks/tuning.py --out tuning-benchmark --methods tuner tpe random --seeds 3
     python benchmarks/tuning.py --out tuning-benchmark --docs    # docs/tuning/benchmark.md from what is there
 
-Every method begins with the same known policy, trains with the same settings, may train twelve times, looks at the same 100
-starts, and is judged on the same 200 fresh ones. TPE and random search draw the fields the rules may edit from the rules'
-ranges, in logarithms, each training going on from the known policy; TPE minimises the distance from the requirement.
+Every method begins with the same known policy, trains with the same settings, may train twelve times, looks at the
+same 100 starts, and is judged on the same 200 fresh ones. TPE and random search draw the fields the rules may edit from
+the rules' ranges, in logarithms, each training going on from the known policy; TPE minimises the distance from the
+requirement.
 A task that was trained once from the same policy with the same seed is not trained again. One process per core;
 what is done is kept, one JSON per requirement, method and seed.
 """
@@ -92,7 +93,7 @@ def search(requirement: Any, fixed: dict, method: str, seed: int, work: Path, ca
 
     from flytune.task.task import write_task
     from flytune.tune.requirement import MARGIN, Measured
-    from flytune.tune.rules import load_rules
+    from flytune.tune.rules import field_of, load_rules
     from flytune.tune.search import Tuner
 
     optuna.logging.set_verbosity(optuna.logging.WARNING)
@@ -100,8 +101,6 @@ def search(requirement: Any, fixed: dict, method: str, seed: int, work: Path, ca
         requirement, load_rules(), work, task=None, edits=fixed, seed=seed, trainer="apg", most_steps=BUDGET,
         tell=lambda line: None, on_progress=None,
     )  # fmt: skip
-    from flytune.tune.rules import field_of
-
     ranges = {
         rule.field: tuple(map(float, rule.range))
         for rule in tuner.rules
@@ -111,12 +110,10 @@ def search(requirement: Any, fixed: dict, method: str, seed: int, work: Path, ca
         and field_of(tuner.tables, rule.field)
     }
     tuner._begin()
-    policies = {0: work / "steps" / "00"}
     if not requirement.misses(tuner.steps[0].measured, MARGIN) and not tuner._verdict(tuner.steps[0]).misses:
         return {"met": True, "trainings": 0}
     sampler = optuna.samplers.TPESampler(seed=seed) if method == "tpe" else optuna.samplers.RandomSampler(seed=seed)
     study = optuna.create_study(sampler=sampler)
-    study.enqueue_trial({name: field_of(tuner.tables, name) for name in ranges})
     study.add_trial(
         optuna.trial.create_trial(
             params={name: min(max(field_of(tuner.tables, name), low), high) for name, (low, high) in ranges.items()},
@@ -147,7 +144,7 @@ def search(requirement: Any, fixed: dict, method: str, seed: int, work: Path, ca
             (known / "measured.json").write_text(json.dumps(step.measured.to_dict()), encoding="utf-8")
         study.tell(trial, requirement.distance(step.measured))
         if not requirement.misses(step.measured, MARGIN) and not tuner._verdict(step).misses:
-            return {"met": True, "trainings": number, "policies": len(policies)}
+            return {"met": True, "trainings": number}
     return {"met": False, "trainings": BUDGET}
 
 
