@@ -8,9 +8,9 @@ Best is the seed with most feasible trials settled on all axes, and of these the
 position; what counts is the policy that is flown by default, on trials that neither training nor `evaluate` uses.
 """
 
+import argparse
 import json
 import shutil
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -32,8 +32,8 @@ def quality(directory: Path, study: Study, role: str) -> tuple[int, float]:
     return int(np.sum(settled & ~judgement.infeasible)), -float(np.median(judgement.steady_state_error["position"]))
 
 
-def ship(folder: Path) -> None:
-    """Copy the best policies of one study."""
+def ship(folder: Path, commit: str | None) -> None:
+    """Copy the best policies of one study; `commit` is that of its code, where it did not run from a checkout."""
     told = json.loads((folder / "verdicts.json").read_text(encoding="utf-8"))
     study = Study(folder=folder, **{name: told[name] for name in ("trainer", "steps", "refined", "seeds")})
     for role in ROLES:
@@ -45,10 +45,17 @@ def ship(folder: Path) -> None:
         target.mkdir(exist_ok=True)
         shutil.copyfile(best.directory / "policy.safetensors", target / f"{stem}.safetensors")
         facts = read_facts(best.directory)
+        # the study's workers were told in files of their own; this gives the same policy bit by bit
+        facts["command"] = f"flytune train {best.preset} --trainer {study.trainer} --seed {best.seed}".split()
+        facts["commit"] = facts["commit"] or commit
         (target / f"{stem}.json").write_text(json.dumps(facts, indent=2) + "\n", encoding="utf-8")
         print(f"{stem}: seed {best.seed}, {quality(best.directory, study, role)}")
 
 
 if __name__ == "__main__":
-    for name in sys.argv[1:]:
-        ship(Path(name))
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("studies", nargs="+", type=Path)
+    parser.add_argument("--commit", help="of the code, where the studies did not run from a checkout")
+    options = parser.parse_args()
+    for study_folder in options.studies:
+        ship(study_folder, options.commit)

@@ -58,6 +58,8 @@ def test_every_step_its_reason_and_the_verdict_are_on_the_page(tmp_path):
         assert words in read.text
     times = read.figures[0]["data"][0]
     assert times["y"] == [3.0, None, 6.1]
+    bands = [(shape["y0"], shape["y1"]) for shape in read.figures[0]["layout"]["shapes"]]
+    assert bands == [pytest.approx((5.4, 6.6)), pytest.approx((0, 5)), pytest.approx((0, 10))]
 
 
 def test_what_was_not_met_is_said_with_its_reason(tmp_path):

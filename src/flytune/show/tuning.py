@@ -63,16 +63,17 @@ def response_per_step(tuning: Mapping[str, Any]) -> go.Figure:
         values = [None if line["measured"][name] is None else factor * line["measured"][name] for line in lines]
         kept = [style.TRIALS[0] if number == tuning["best"] else "white" for number in numbers]
         marker = {"size": 9, "color": kept, "line": {"color": style.TRIALS[0], "width": 1.6}}
-        figure.add_hrect(y0=low, y1=high, fillcolor=style.BAND, line_width=0, row=1, col=column)  # pyright: ignore
         figure.add_trace(
             go.Scatter(x=numbers, y=values, mode="lines+markers", line={"color": style.TRIALS[0], "width": 1.2},
                        marker=marker, showlegend=False, hovertemplate="%{y:.3g}"),
             row=1, col=column,
         )  # fmt: skip
+        # after the trace: plotly leaves an empty panel without it
+        figure.add_hrect(y0=low, y1=high, fillcolor=style.BAND, line_width=0, row=1, col=column)  # pyright: ignore
         top = max([value for value in values if value is not None] + [high])
         figure.update_yaxes(range=[0, 1.1 * top], row=1, col=column)
     figure.update_xaxes(title_text="step", dtick=1 if len(numbers) < 15 else None)
-    return style.frame(figure, 340, margin={"l": 50, "r": 14, "t": 40, "b": 48})
+    return style.frame(figure, 360, margin={"l": 50, "r": 14, "t": 64, "b": 48})
 
 
 def _steps(tuning: Mapping[str, Any]) -> str:

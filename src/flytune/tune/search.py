@@ -156,7 +156,8 @@ class Tuner:
         if wanted is None and policy is None:
             name = "baseline-refined"
             task = load_task(name, self.edits)
-        return name, self._prepared(task, policy), policy
+        named = dataclasses.replace(task, name=f"{task.name}-tuned-{self.requirement.settling_time:g}s")
+        return name, self._prepared(named, policy), policy
 
     def _prepared(self, task: Task, policy: Policy | None) -> Task:
         """The task with episodes as long as the response asked for, and a trainer that goes on from a policy."""
@@ -231,7 +232,8 @@ class Tuner:
     def _take(self, origin: Step, edit: Edit) -> None:
         number = len(self.steps)
         self.tell(f"edit {number:<3} {describe_edit(edit)}")
-        why = f"tuned: {edit.before:g} -> {edit.after:g}, {edit.condition}: {edit.says} ({edit.rule}, {edit.source})"
+        so_far = origin.reasons.get(edit.field, f"tuned: {edit.before:g}").split(",")[0]
+        why = f"{so_far} -> {edit.after:g}, {edit.condition}: {edit.says} ({edit.rule}, {edit.source})"
         self._train(
             number, {**origin.values, edit.field: edit.after}, {**origin.reasons, edit.field: why}, edit, origin.number
         )
