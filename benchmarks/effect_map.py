@@ -4,9 +4,9 @@
     python benchmarks/effect_map.py --docs              # draws docs/heuristics/ from it
 
 One knob of baseline-refined at a time, five values, three seeds of episodes and noise; trained as the tuner trains, on
-from the policy that ships. (From new weights, 300 updates leave the unchanged baseline at 5.4 s, on its way to 3.0 s: what
-is then measured is how far a training has come.) The unchanged task is trained once per seed and stands in the curve
-of every knob. Processes side by side, one per core.
+from the policy that ships. (From new weights, 300 updates leave the unchanged baseline at 5.4 s, on its way to 3.0 s:
+what is then measured is how far a training has come.) The unchanged task is trained once per seed and stands in the
+curve of every knob. Processes side by side, one per core.
 """
 
 import argparse
@@ -65,8 +65,8 @@ def fly_one(folder: Path, updates: int, job: tuple[str | None, float | None, int
     """Train one task and write down how it flies."""
     from flytune.control.policy import load_policy
     from flytune.errors import Diverged
-    from flytune.learn.shipped import shipped_files
     from flytune.learn.run import train
+    from flytune.learn.shipped import shipped_files
     from flytune.response.fly import fly
     from flytune.response.judge import AXES, judge
     from flytune.task.task import load_task
