@@ -57,12 +57,12 @@ def test_a_response_that_is_off_in_time_moves_the_speed_bound(time, name, way):
 
 def test_the_second_edit_follows_the_slope_of_the_first():
     wanted = make_requirement(2)
-    steps = after([step(settling_time=4.0)], wanted, settling_time=3.0)
+    steps = after([step(settling_time=4.0)], wanted, settling_time=2.5)
     first = steps[1].edit
-    slope = math.log(3 / 4) / math.log(first.after / first.before)
+    slope = math.log(2.5 / 4) / math.log(first.after / first.before)
     _, edit = chosen(steps, wanted)
     assert edit.known_from == "flown"
-    assert math.log(edit.after / first.after) == pytest.approx(math.log(2 / 3) / slope, rel=0.02)
+    assert math.log(edit.after / first.after) == pytest.approx(math.log(2 / 2.5) / slope, rel=0.02)
 
 
 def test_between_a_faster_and_a_slower_step_the_bound_is_interpolated():
