@@ -306,4 +306,4 @@ def test_a_refined_preset_gives_a_reason_for_everything_it_changes(role):
         if not path.startswith(("name", "sources")) and before.get(path) != value
     }
     assert changed
-    assert {path for path in changed if not refined.sources.get(path, "").startswith("refined: ")} == set()
+    assert {path for path in changed if not source_of(path, refined.sources).startswith("refined: ")} == set()

@@ -141,7 +141,7 @@ def _edit(
     slope, known_from = _slope(rule, value, step, steps, effects)
     if slope is None:
         return known_from, 0.0
-    aim = _aim(rule.measure, requirement, margin)
+    aim = math.nan if rule.measure in ("settled", "kept") else _aim(rule.measure, requirement, margin)
     now = getattr(step.measured, rule.measure)
     up = 1 if rule.direction == "up" else -1
     expects: float | None
