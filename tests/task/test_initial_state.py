@@ -78,8 +78,10 @@ def test_five_percent_of_the_papers_starts_lie_below_the_altitude_bound():
 
 
 def test_every_preset_trains_from_the_same_starts(tasks):
-    for task in tasks.values():
-        assert task.initial_state == tasks["baseline"].initial_state
+    for role in ("baseline", "acrobatic", "inspection"):
+        assert tasks[role].initial_state == tasks["baseline"].initial_state
+        refined = tasks[f"{role}-refined"].initial_state
+        assert refined == tasks["baseline-refined"].initial_state
 
 
 def test_a_box_upside_down_is_refused(tasks):
