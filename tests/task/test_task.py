@@ -154,7 +154,7 @@ def test_every_number_is_written_with_its_unit_its_range_and_where_it_comes_from
 @pytest.mark.parametrize("preset", preset_names())
 def test_no_number_of_a_preset_is_written_without_a_source(every, preset):
     text = every[preset, "crazyflie"][1]
-    text = text.replace('= true # ', '= true # 1; ').replace('= false # ', '= false # 1; ')  # a yes or no has no unit
+    text = text.replace("= true # ", "= true # 1; ").replace("= false # ", "= false # 1; ")  # a yes or no has no unit
     numbers = [line for line in text.split("[sources]")[0].splitlines() if " = " in line and '= "' not in line]
     assert len(numbers) > 50
     assert [line for line in numbers if line.count("; ") < 2] == []
