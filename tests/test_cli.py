@@ -1,16 +1,15 @@
 """The command line as a user meets it: real processes, their output, their exit codes, and what they leave behind."""
 
 import json
-import os
 import re
 import shutil
-import signal
 import subprocess
 import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
+from tests.command import flytune, interrupted
 
 SMALL = [
     "apg.environments=4",
@@ -18,13 +17,6 @@ SMALL = [
     "apg.updates=4",
     "apg.hidden=[8, 8]",
 ]
-
-
-def flytune(*arguments, cwd, expect=0, timeout=300):
-    command = [sys.executable, "-m", "flytune", *map(str, arguments)]
-    answer = subprocess.run(command, cwd=cwd, capture_output=True, text=True, timeout=timeout, check=False)
-    assert answer.returncode == expect, answer.stderr
-    return answer
 
 
 @pytest.fixture(scope="module")
@@ -204,20 +196,7 @@ def test_ctrl_c_saves_a_checkpoint_exits_with_130_and_resumes_to_the_same_policy
     train = ["train", "baseline", "--set", *edits]
     whole = flytune(*train, "--out", "whole", cwd=folder)
     assert whole.stdout.splitlines()[-1] == "whole"
-    process = subprocess.Popen(
-        [sys.executable, "-m", "flytune", *train, "--out", "cut"],
-        cwd=folder,
-        stderr=subprocess.PIPE,
-        text=True,
-        env={**os.environ, "PYTHONUNBUFFERED": "1"},
-    )
-    assert process.stderr is not None
-    for line in process.stderr:
-        if "10 %" in line:
-            process.send_signal(signal.SIGINT)
-            break
-    message = process.stderr.read()
-    assert process.wait(timeout=120) == 130, message
+    message = interrupted(*train, "--out", "cut", cwd=folder, at="10 %")
     assert "cut/checkpoint" in message
     assert "flytune train cut/task.toml --trainer apg --seed 0 --out cut --resume" in message
     assert not (folder / "cut" / "policy.safetensors").exists()

@@ -6,7 +6,8 @@ import subprocess
 import sys
 
 import pytest
-from tests.test_cli import SMALL, flytune
+from tests.command import flytune
+from tests.test_cli import SMALL
 
 SHORT = ["--trials", 4, "--duration", 2]
 

@@ -1,21 +1,11 @@
 """`flytune tune` and `flytune rules` as a user meets them: real processes, exit codes, and what they leave behind."""
 
 import json
-import os
-import signal
-import subprocess
-import sys
 
 import pytest
+from tests.command import flytune, interrupted
 
 from flytune.tune.rules import load_rules
-
-
-def flytune(*arguments, cwd, expect=0, timeout=300):
-    command = [sys.executable, "-m", "flytune", *map(str, arguments)]
-    answer = subprocess.run(command, cwd=cwd, capture_output=True, text=True, timeout=timeout, check=False)
-    assert answer.returncode == expect, answer.stderr
-    return answer
 
 
 def test_the_rules_are_printed_as_a_table_and_as_json(tmp_path):
@@ -75,21 +65,7 @@ def test_what_cannot_be_met_ends_with_code_4_the_reason_and_the_best_so_far(tmp_
 @pytest.mark.slow
 def test_an_interrupted_tuning_keeps_its_steps_and_goes_on(tmp_path):
     arguments = ["tune", "baseline-refined", "--settling-time", "5", "--out", "mine"]
-    process = subprocess.Popen(
-        [sys.executable, "-m", "flytune", *arguments],
-        cwd=tmp_path,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        env={**os.environ, "PYTHONUNBUFFERED": "1"},
-    )
-    assert process.stderr is not None
-    for line in process.stderr:
-        if "50 %" in line:
-            process.send_signal(signal.SIGINT)
-            break
-    message = process.stderr.read()
-    assert process.wait(timeout=120) == 130, message
+    message = interrupted(*arguments, cwd=tmp_path, at="50 %")
     assert "interrupted in step 1" in message
     before = json.loads((tmp_path / "mine" / "tune.json").read_text())
     assert [step["number"] for step in before["steps"]] == [0]

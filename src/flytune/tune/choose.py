@@ -59,6 +59,19 @@ class Step:
         return cls(**{**data, "edit": edit, "measured": Measured.from_dict(data["measured"])})
 
 
+@dataclasses.dataclass(frozen=True)
+class _Case:
+    """All that a choice rests on; what each is, `choose` says."""
+
+    steps: Sequence[Step]
+    tables: Mapping[str, Any]
+    requirement: Requirement
+    rules: Sequence[Rule]
+    effects: Effects
+    fixed: Sequence[str]
+    margin: float
+
+
 def choose(
     steps: Sequence[Step],
     tables: Mapping[str, Any],
@@ -79,6 +92,7 @@ def choose(
         fixed: field paths the user has set; they, and what lies under them, are not touched.
         margin: the share of the tolerance that counts as met.
     """
+    case = _Case(steps, tables, requirement, rules, effects, fixed, margin)
     last = steps[-1]
     if (edit := _half_way(steps, requirement)) is not None:
         return steps[last.origin or 0], edit
@@ -86,30 +100,20 @@ def choose(
     refused: list[str] = []
     for origin in dict.fromkeys(step.number for step in (ranked[0], last)):
         step = steps[origin]
-        found = _best_edit(step, steps, tables, requirement, rules, effects, fixed, margin, refused)
+        found = _best_edit(case, step, refused)
         if found is not None:
             return step, found
     return refused
 
 
-def _best_edit(
-    step: Step,
-    steps: Sequence[Step],
-    tables: Mapping[str, Any],
-    requirement: Requirement,
-    rules: Sequence[Rule],
-    effects: Effects,
-    fixed: Sequence[str],
-    margin: float,
-    refused: list[str],
-) -> Edit | None:
-    misses = requirement.misses(step.measured, margin)
+def _best_edit(case: _Case, step: Step, refused: list[str]) -> Edit | None:
+    misses = case.requirement.misses(step.measured, case.margin)
     options: list[tuple[float, Edit]] = []
     for condition in conditions(misses):
-        for rule in rules:
+        for rule in case.rules:
             if rule.advice or rule.when != condition:
                 continue
-            edit, gain = _edit(rule, step, steps, tables, requirement, effects, fixed, margin, misses)
+            edit, gain = _edit(case, rule, step, misses)
             if isinstance(edit, str):
                 refused.append(f"{condition}: {rule.name}: {edit}")
             else:
@@ -117,31 +121,21 @@ def _best_edit(
     return max(options, key=lambda option: option[0])[1] if options else None
 
 
-def _edit(
-    rule: Rule,
-    step: Step,
-    steps: Sequence[Step],
-    tables: Mapping[str, Any],
-    requirement: Requirement,
-    effects: Effects,
-    fixed: Sequence[str],
-    margin: float,
-    misses: Mapping[str, float],
-) -> tuple[Edit | str, float]:
+def _edit(case: _Case, rule: Rule, step: Step, misses: Mapping[str, float]) -> tuple[Edit | str, float]:
     """The edit a rule asks for and its gain, the share of what is missing that it promises; or why it is not used."""
-    if any(rule.field == path or rule.field.startswith(f"{path}.") for path in fixed):
+    if any(rule.field == path or rule.field.startswith(f"{path}.") for path in case.fixed):
         return f"{rule.field} is set by the user", 0.0
-    value = step.values.get(rule.field) or field_of(dict(tables), rule.field)
+    value = step.values.get(rule.field) or field_of(dict(case.tables), rule.field)
     if not value or value <= 0:
         return f"the task has no {rule.field}, or it is 0", 0.0
     if missed := [measure for measure in rule.spares if measure in misses and measure != rule.measure]:
         return f"forbidden while {', '.join(missed)} is missed", 0.0
-    if _disappointed(rule, steps):
+    if _disappointed(rule, case.steps):
         return "it was tried, and did not help", 0.0
-    slope, known_from = _slope(rule, value, step, steps, effects)
+    slope, known_from = _slope(rule, value, step, case.steps, case.effects)
     if slope is None:
         return known_from, 0.0
-    aim = math.nan if rule.measure in ("settled", "kept") else _aim(rule.measure, requirement, margin)
+    aim = math.nan if rule.measure in ("settled", "kept") else _aim(rule.measure, case.requirement, case.margin)
     now = getattr(step.measured, rule.measure)
     up = 1 if rule.direction == "up" else -1
     expects: float | None
@@ -150,7 +144,7 @@ def _edit(
     else:
         wanted = math.log(aim / max(now, 1e-9))
         factor = math.exp(max(-3.0, min(3.0, wanted / slope)))
-        bracketed = _between(rule, step, steps, aim) if rule.measure == "settling_time" else None
+        bracketed = _between(rule, step, case.steps, aim) if rule.measure == "settling_time" else None
         after = moved(rule, value, bracketed / value if bracketed else factor)
         promised = slope * math.log(after / value)
         gain = min(1.0, promised / wanted) if wanted else 0.0
@@ -168,7 +162,7 @@ def _edit(
         expects=expects,
         known_from=known_from,
     )
-    cost = EFFORT * abs(math.log(after / value)) + _harm(rule, value, after, step, requirement, effects, misses)
+    cost = EFFORT * abs(math.log(after / value)) + _harm(case, edit, step, rule.measure, misses)
     return edit, gain * TRUST[known_from] - cost
 
 
@@ -254,26 +248,20 @@ def _disappointed(rule: Rule, steps: Sequence[Step]) -> bool:
     return (now - before) / (expects - before) < 0.1 if expects != before else False
 
 
-def _harm(
-    rule: Rule,
-    value: float,
-    after: float,
-    step: Step,
-    requirement: Requirement,
-    effects: Effects,
-    misses: Mapping[str, float],
-) -> float:
+def _harm(case: _Case, edit: Edit, step: Step, own: str, misses: Mapping[str, float]) -> float:
     """What the edit is measured to cost in the other measures: a half for each it pushes over its bound."""
     cost = 0.0
     for measure in MEASURES:
-        if measure == rule.measure or measure in misses:
+        if measure == own or measure in misses:
             continue
-        slope = effects.elasticity(rule.field, measure, value)
-        if slope is None or not effects.matters(rule.field, measure, value):
+        slope = case.effects.elasticity(edit.field, measure, edit.before)
+        if slope is None or not case.effects.matters(edit.field, measure, edit.before):
             continue
         now = max(getattr(step.measured, measure), 0.002 if measure == "overshoot" else 1e-6)
-        then = dataclasses.replace(step.measured, **{measure: now * math.exp(slope * math.log(after / value))})
-        cost += 0.5 * (measure in requirement.misses(then))
+        then = dataclasses.replace(
+            step.measured, **{measure: now * math.exp(slope * math.log(edit.after / edit.before))}
+        )
+        cost += 0.5 * (measure in case.requirement.misses(then))
     return cost
 
 

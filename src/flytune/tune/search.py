@@ -22,7 +22,9 @@ from flytune.tune.choose import Edit, Step, choose
 from flytune.tune.effects import load_effects
 from flytune.tune.limits import check_possible
 from flytune.tune.requirement import MARGIN, Requirement
+from flytune.tune.result import Tuning, Verdict
 from flytune.tune.rules import Rule
+from flytune.tune.words import describe, describe_edit, describe_step
 
 TUNING_SEED, TUNING_TRIALS = 3000, 100  # the starts that are looked at again and again
 FRESH_SEED, FRESH_TRIALS = 4000, 200  # the starts of a verdict; each verdict has its own
@@ -30,71 +32,6 @@ MOST_STEPS = 12
 STARTS = ("acrobatic-refined", "baseline-refined", "inspection-refined")  # known tasks, fastest first
 
 Tell = Callable[[str], None]
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class Verdict:
-    """A step judged on starts the tuning never saw."""
-
-    step: int
-    seed: int
-    judgement: dict[str, Any]
-    misses: dict[str, float]
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class Tuning:
-    """What a tuning came to."""
-
-    requirement: Requirement
-    start: str
-    steps: list[Step]
-    verdicts: list[Verdict]
-    best: int
-    blocked: list[str]  # why no rule could help, where it ended without success
-    directory: Path
-
-    @property
-    def met(self) -> bool:
-        """Whether the best policy meets the requirement on fresh starts."""
-        return any(verdict.step == self.best and not verdict.misses for verdict in self.verdicts)
-
-    def why(self) -> str:
-        """What is missing of the best policy, and what stands in the way, in one line."""
-        best = self.steps[self.best]
-        missing = self.requirement.misses(best.measured, MARGIN) or next(
-            (verdict.misses for verdict in self.verdicts if verdict.step == self.best), {}
-        )
-        said = ", ".join(_miss_said(name, size, self.requirement) for name, size in missing.items())
-        return (
-            f"not met: {said}. " + ("; ".join(self.blocked) or "no rule can help") + f". Best kept in {self.directory}."
-        )
-
-    def to_dict(self) -> dict[str, Any]:
-        """Plain values, for a page: `lines` is what was said of each step."""
-        lines = []
-        for step in self.steps:
-            before = self.steps[step.origin].measured if step.origin is not None else None
-            lines.append(
-                {
-                    "number": step.number,
-                    "origin": step.origin,
-                    "edit": describe_edit(step.edit) if step.edit else f"start: {self.start}",
-                    "response": describe_step(step, before, self.requirement),
-                    "seconds": step.seconds,
-                    "measured": step.measured.to_dict(),
-                }
-            )
-        return {
-            "title": str(self.requirement),
-            "requirement": self.requirement.to_dict(),
-            "start": self.start,
-            "met": self.met,
-            "best": self.best,
-            "why": "" if self.met else self.why(),
-            "lines": lines,
-            "verdicts": [dataclasses.asdict(verdict) for verdict in self.verdicts],
-        }
 
 
 class Tuner:
@@ -427,61 +364,6 @@ def tune(
     tell(f"{'done' if result.met else 'not met'}     step {result.best} after {trained} trainings, "
          f"{time.monotonic() - begun:.0f} s")  # fmt: skip
     return result
-
-
-def describe(measured: Any, requirement: Requirement) -> str:
-    """A measured response in words."""
-    time_said = f"{measured.settling_time:.2f} s" if math.isfinite(measured.settling_time) else "never"
-    error = f"{math.degrees(measured.error):.2f} deg" if requirement.axis == "yaw" else f"{1e3 * measured.error:.1f} mm"
-    kept = f", own bounds kept in {measured.kept:.0%}" if measured.kept < 1 else ""
-    return (
-        f"settles in {time_said}, overshoot {100 * measured.overshoot:.1f} %, error {error}, "
-        f"{measured.settled:.1%} settled{kept}"
-    )
-
-
-def describe_edit(edit: Edit) -> str:
-    """An edit and its reason in one line."""
-    known = {"flown": "from the steps so far", "map": "from the effect map", "rule": "by the rule"}[edit.known_from]
-    promise = ""
-    if edit.expects is not None:
-        promise = f"; expects {_value_said(edit.measure, edit.expects)}, {known}"
-    return (
-        f"{edit.condition}: {edit.field} {edit.before:g} -> {edit.after:g} ({edit.rule}: {edit.says}; "
-        f"{edit.source}{promise})"
-    )
-
-
-def describe_step(step: Step, before: Any, requirement: Requirement) -> str:
-    """What a step's response is, what is missing of it, and what its edit did."""
-    parts = [describe(step.measured, requirement)]
-    if step.edit is not None and before is not None:
-        measure = step.edit.measure
-        was, now = getattr(before, measure), getattr(step.measured, measure)
-        parts.append(f"{_named(measure)} {_value_said(measure, was)} -> {_value_said(measure, now)}")
-    misses = requirement.misses(step.measured, MARGIN)
-    parts.append(f"missing: {', '.join(_miss_said(n, s, requirement) for n, s in misses.items())}" if misses else "met")
-    return "; ".join(parts)
-
-
-def _miss_said(measure: str, size: float, requirement: Requirement) -> str:
-    if measure == "settling_time":
-        side = "slow" if size > 0 else "fast"
-        share = f"{abs(math.expm1(size)):.0%}" if math.isfinite(size) else "far"
-        return f"{share} too {side} for {requirement.aim():g} s"
-    return {"settled": "trials do not settle", "kept": "bounds are broken"}.get(measure, f"{_named(measure)} too large")
-
-
-def _named(measure: str) -> str:
-    return {"settling_time": "settling time", "kept": "bounds kept"}.get(measure, measure)
-
-
-def _value_said(measure: str, value: float) -> str:
-    if not math.isfinite(value):
-        return "never"
-    if measure == "settling_time":
-        return f"{value:.2f} s"
-    return f"{1e3 * value:.1f} mm" if measure == "error" else f"{value:.1%}"
 
 
 def _shipped(name: str) -> Policy | None:
