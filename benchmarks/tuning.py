@@ -6,7 +6,7 @@
 Every method begins with the same known policy, trains with the same settings, may train twelve times, looks at the
 same 100 starts, and is judged on the same 200 fresh ones. TPE and random search draw the fields the rules may edit from
 the rules' ranges, in logarithms, each training going on from the known policy; TPE minimises the distance from the
-requirement.
+requirement, after four random draws.
 A task that was trained once from the same policy with the same seed is not trained again. One process per core;
 what is done is kept, one JSON per requirement, method and seed.
 """
@@ -112,7 +112,7 @@ def search(requirement: Any, fixed: dict, method: str, seed: int, work: Path, ca
     tuner._begin()
     if not requirement.misses(tuner.steps[0].measured, MARGIN) and not tuner._verdict(tuner.steps[0]).misses:
         return {"met": True, "trainings": 0}
-    sampler = optuna.samplers.TPESampler(seed=seed) if method == "tpe" else optuna.samplers.RandomSampler(seed=seed)
+    sampler = optuna.samplers.TPESampler(seed=seed, n_startup_trials=4) if method == "tpe" else optuna.samplers.RandomSampler(seed=seed)
     study = optuna.create_study(sampler=sampler)
     study.add_trial(
         optuna.trial.create_trial(
@@ -128,7 +128,7 @@ def search(requirement: Any, fixed: dict, method: str, seed: int, work: Path, ca
         trial = study.ask()
         values = {name: trial.suggest_float(name, low, high, log=True) for name, (low, high) in ranges.items()}
         reasons = dict.fromkeys(values, method)
-        text = write_task(tuner.task_of(values, reasons)).replace(method, "")
+        text = write_task(dataclasses.replace(tuner.task_of(values, reasons), name="")).replace(method, "")
         key = hashlib.sha256(f"{tuner.start} {seed} {tuner.duration} {text}".encode()).hexdigest()[:24]
         known = cache / key
         if (known / "measured.json").exists():
@@ -154,16 +154,24 @@ def summary(folder: Path) -> str:
 
     rows = [json.loads(path.read_text(encoding="utf-8")) for path in sorted(folder.glob("*-*.json"))]
     methods = [method for method in ("tuner", "tpe", "random") if any(row["method"] == method for row in rows)]
-    lines = ["| method | met | trainings until met, median [95 % interval] | seconds, median |", "|---|---|---|---|"]
-    for method in methods:
-        mine = [row for row in rows if row["method"] == method and "refused" not in row]
+    tried = [{row["requirement"] for row in rows if row["method"] == method} for method in methods]
+    shared = set.intersection(*tried)
+    groups = [("tuner, all seeds", [row for row in rows if row["method"] == "tuner"])]
+    groups += [
+        (f"{method}, seed 0", [r for r in rows if (r["method"], r["seed"]) == (method, 0) and r["requirement"] in shared])
+        for method in methods
+    ]
+    lines = ["| | met | trainings until met, median [95 % interval] | seconds, median |", "|---|---|---|---|"]
+    for title, chosen in groups:
+        mine = [row for row in chosen if "refused" not in row]
         needed = [float(row["trainings"]) if row["met"] else float("inf") for row in mine]
         seconds = sorted(row["seconds"] for row in mine)
         low, high = bootstrap_interval([needed])
         middle = sorted(needed)[(len(needed) - 1) // 2]
         told = " to ".join("never" if end is None else f"{end:g}" for end in (low, high))
+        median = f"{middle:g}" if middle < float("inf") else "never"
         lines.append(
-            f"| {method} | {sum(row['met'] for row in mine)} of {len(mine)} | {middle:g} [{told}] | "
+            f"| {title} | {sum(row['met'] for row in mine)} of {len(mine)} | {median} [{told}] | "
             f"{seconds[len(seconds) // 2]:.0f} |"
         )
     lines += ["", f"| requirement | {' | '.join(methods)} |", f"|---|{'---|' * len(methods)}"]
@@ -187,6 +195,7 @@ if __name__ == "__main__":
     parser.add_argument("--out", type=Path, default=Path("tuning-benchmark"))
     parser.add_argument("--methods", nargs="+", choices=("tuner", "tpe", "random"), default=["tuner", "tpe", "random"])
     parser.add_argument("--seeds", type=int, default=3, help="of the tuner; the others have one")
+    parser.add_argument("--requirements", type=int, nargs="+", default=range(len(GRID)), help="their places in GRID")
     parser.add_argument("--workers", type=int, default=os.cpu_count() or 1)
     parser.add_argument("--docs", action="store_true", help="write docs/tuning/benchmark.md; tunes nothing")
     options = parser.parse_args()
@@ -200,7 +209,7 @@ if __name__ == "__main__":
             (options.out, index, method, seed)
             for method in options.methods
             for seed in range(options.seeds if method == "tuner" else 1)
-            for index in range(len(GRID))
+            for index in options.requirements
             if not (options.out / f"{name_of(index)}-{method}-{seed}.json").exists()
         ]
         with multiprocessing.get_context("spawn").Pool(options.workers) as pool:
