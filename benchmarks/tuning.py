@@ -112,8 +112,11 @@ def search(requirement: Any, fixed: dict, method: str, seed: int, work: Path, ca
     tuner._begin()
     if not requirement.misses(tuner.steps[0].measured, MARGIN) and not tuner._verdict(tuner.steps[0]).misses:
         return {"met": True, "trainings": 0}
-    sampler = optuna.samplers.TPESampler(seed=seed, n_startup_trials=4) if method == "tpe" else optuna.samplers.RandomSampler(seed=seed)
-    study = optuna.create_study(sampler=sampler)
+    samplers = {
+        "tpe": optuna.samplers.TPESampler(seed=seed, n_startup_trials=4),
+        "random": optuna.samplers.RandomSampler(seed),
+    }
+    study = optuna.create_study(sampler=samplers[method])
     study.add_trial(
         optuna.trial.create_trial(
             params={name: min(max(field_of(tuner.tables, name), low), high) for name, (low, high) in ranges.items()},
@@ -157,10 +160,8 @@ def summary(folder: Path) -> str:
     tried = [{row["requirement"] for row in rows if row["method"] == method} for method in methods]
     shared = set.intersection(*tried)
     groups = [("tuner, all seeds", [row for row in rows if row["method"] == "tuner"])]
-    groups += [
-        (f"{method}, seed 0", [r for r in rows if (r["method"], r["seed"]) == (method, 0) and r["requirement"] in shared])
-        for method in methods
-    ]
+    first = [row for row in rows if row["seed"] == 0 and row["requirement"] in shared]
+    groups += [(f"{method}, seed 0", [row for row in first if row["method"] == method]) for method in methods]
     lines = ["| | met | trainings until met, median [95 % interval] | seconds, median |", "|---|---|---|---|"]
     for title, chosen in groups:
         mine = [row for row in chosen if "refused" not in row]
@@ -207,9 +208,9 @@ if __name__ == "__main__":
         options.out.mkdir(parents=True, exist_ok=True)
         missing = [
             (options.out, index, method, seed)
+            for index in options.requirements
             for method in options.methods
             for seed in range(options.seeds if method == "tuner" else 1)
-            for index in options.requirements
             if not (options.out / f"{name_of(index)}-{method}-{seed}.json").exists()
         ]
         with multiprocessing.get_context("spawn").Pool(options.workers) as pool:
