@@ -280,7 +280,7 @@ def _half_way(steps: Sequence[Step], requirement: Requirement) -> Edit | None:
         return None
     return dataclasses.replace(
         last.edit, rule=HALF_WAY, source="flytune", after=middle, expects=None,
-        says=f"{last.edit.rule} went too far: {last.measured.settled:.0%} of the trials settled",
+        says=f"after {last.edit.rule} only {last.measured.settled:.0%} of the trials settled",
     )  # fmt: skip
 
 

@@ -3,7 +3,7 @@
 import math
 from typing import Any
 
-from flytune.tune.choose import Edit, Step
+from flytune.tune.choose import HALF_WAY, Edit, Step
 from flytune.tune.requirement import MARGIN, Requirement
 
 
@@ -24,8 +24,9 @@ def describe_edit(edit: Edit) -> str:
     promise = ""
     if edit.expects is not None:
         promise = f"; expects {_value_said(edit.measure, edit.expects)}, {known}"
+    condition = "too far" if edit.rule == HALF_WAY else edit.condition
     return (
-        f"{edit.condition}: {edit.field} {edit.before:g} -> {edit.after:g} ({edit.rule}: {edit.says}; "
+        f"{condition}: {edit.field} {edit.before:g} -> {edit.after:g} ({edit.rule}: {edit.says}; "
         f"{edit.source}{promise})"
     )
 
