@@ -1,20 +1,21 @@
 """Is the heuristic any good? The tuner, Optuna's TPE and random search on the same requirements, with the same budget.
 
-    python benchmarks/tuning.py --out tuning-benchmark --methods tuner tpe random --seeds 3
+    python benchmarks/tuning.py --out tuning-benchmark           # about two hours on two cores; what is done is kept
     python benchmarks/tuning.py --out tuning-benchmark --docs    # docs/tuning/benchmark.md from what is there
 
 Every method begins with the same known policy, trains with the same settings, may train twelve times, looks at the
-same 100 starts, and is judged on the same 200 fresh ones. TPE and random search draw the fields the rules may edit from
+same tuning starts, and is judged on the same fresh ones. TPE and random search draw the fields the rules may edit from
 the rules' ranges, in logarithms, each training going on from the known policy; TPE minimises the distance from the
-requirement, after four random draws.
-A task that was trained once from the same policy with the same seed is not trained again. One process per core;
-what is done is kept, one JSON per requirement, method and seed.
+requirement, and is told how the known policy flies before its first draw; its first four draws are random.
+
+A training that was made before (the same task, first policy and seed) is taken from the cache that all share; its
+seconds count as if it had been made again. One process per core; one JSON per requirement, method and seed.
 """
 
 import argparse
-import dataclasses
 import hashlib
 import json
+import math
 import multiprocessing
 import os
 import shutil
@@ -22,96 +23,135 @@ import time
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 BUDGET = 12
 SPEED = "termination.speed.bound"
-# settling time [s], overshoot [%], error [m], at most, fixed fields
-GRID = [
-    *[(time, 5.0, 0.01, False, {}) for time in (1.5, 2.0, 2.5, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0)],
-    *[(time, 0.0, 0.01, False, {}) for time in (2.0, 3.5, 7.0)],
-    *[(time, 10.0, 0.005, False, {}) for time in (1.5, 2.5, 5.0, 10.0)],
-    (3.0, 2.0, 0.02, False, {}),
-    (2.0, 5.0, 0.01, True, {}),
-    (4.0, 1.0, 0.005, True, {}),
-    (3.5, 5.0, 0.01, False, {SPEED: 0.8}),
-    (5.0, 5.0, 0.01, False, {SPEED: 0.8}),
-    (6.0, 5.0, 0.01, True, {SPEED: 0.5}),
-    (5.0, 5.0, 0.01, False, {SPEED: 0.45}),
+# settling time [s], overshoot [%], error [m or deg], what else is asked, fixed fields
+GRID: list[tuple[float, float, float, dict[str, Any], dict[str, float]]] = [
+    *[(time, 5.0, 0.01, {}, {}) for time in (1.5, 2.0, 2.5, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0)],
+    *[(time, 0.0, 0.01, {}, {}) for time in (2.0, 3.5, 7.0)],
+    *[(time, 10.0, 0.005, {}, {}) for time in (1.5, 2.5, 5.0, 10.0)],
+    (3.0, 2.0, 0.02, {}, {}),
+    (2.0, 5.0, 0.001, {}, {}),
+    (6.0, 0.0, 0.001, {}, {}),
+    (2.0, 5.0, 0.01, {"at_most": True}, {}),
+    (4.0, 1.0, 0.005, {"at_most": True}, {}),
+    (5.0, 5.0, 0.01, {"percentile": 90.0}, {}),
+    (2.0, 5.0, 0.01, {"axis": "z"}, {}),
+    (1.0, 5.0, 1.0, {"axis": "yaw"}, {}),
+    (3.5, 5.0, 0.01, {}, {SPEED: 0.8}),
+    (5.0, 5.0, 0.01, {}, {SPEED: 0.8}),
+    (6.0, 5.0, 0.01, {"at_most": True}, {SPEED: 0.5}),
+    (5.0, 5.0, 0.01, {}, {SPEED: 0.45}),
     # impossible: to be refused
-    (1.5, 5.0, 0.01, False, {SPEED: 0.8}),
-    (5.0, 5.0, 0.01, True, {SPEED: 0.2}),
-    (0.3, 5.0, 0.01, False, {}),
+    (1.5, 5.0, 0.01, {}, {SPEED: 0.8}),
+    (5.0, 5.0, 0.01, {"at_most": True}, {SPEED: 0.2}),
+    (0.3, 5.0, 0.01, {}, {}),
 ]
+
+
+def title_of(index: int) -> str:
+    """A requirement in words."""
+    time, overshoot, error, more, fixed = GRID[index]
+    axis = more.get("axis", "")
+    wanted = f"{axis} {'at most ' if 'at_most' in more else ''}{time:g} s".strip()
+    share = f" (percentile {more['percentile']:g})" if "percentile" in more else ""
+    exact = f"{error:g} deg" if axis == "yaw" else f"{1e3 * error:g} mm"
+    bound = "".join(f", speed bound {value:g} m/s" for value in fixed.values())
+    return f"{wanted}{share}, {overshoot:g} %, {exact}{bound}"
 
 
 def name_of(index: int) -> str:
     """A requirement in a file name."""
-    time, overshoot, error, at_most, fixed = GRID[index]
-    bound = "".join(f"-v{value:g}" for value in fixed.values())
-    return f"{'le' if at_most else 't'}{time:g}-o{overshoot:g}-e{1e3 * error:g}{bound}"
-
-
-def requirement_of(index: int) -> tuple[Any, dict[str, float]]:
-    """A requirement and the fields that are fixed with it."""
-    from flytune.tune.requirement import make_requirement
-
-    time, overshoot, error, at_most, fixed = GRID[index]
-    return make_requirement(time, overshoot, error, at_most=at_most), dict(fixed)
+    return "".join(letter if letter.isalnum() or letter == "." else "-" for letter in title_of(index)).replace(
+        "--", "-"
+    )
 
 
 def solve(folder: Path, index: int, method: str, seed: int) -> None:
     """One requirement by one method, written down."""
-    from flytune.errors import BadInput
-    from flytune.tune.rules import load_rules
-    from flytune.tune.search import tune
+    import jax
 
-    requirement, fixed = requirement_of(index)
+    from flytune.control.policy import Policy, load_policy
+    from flytune.document import plain
+    from flytune.errors import BadInput
+    from flytune.task.task import Task
+    from flytune.tune.requirement import make_requirement
+    from flytune.tune.rules import load_rules
+    from flytune.tune.search import Tuner
+
+    class CachedTuner(Tuner):
+        """A tuner that makes no training twice."""
+
+        spent = 0.0  # s in trainings made now
+
+        def learn(self, task: Task, initial: Policy | None, folder: Path, number: int) -> tuple[Policy, float]:
+            tables = {name: value for name, value in plain(task).items() if name not in ("name", "duration", "sources")}
+            start = b"".join(np.asarray(leaf).tobytes() for leaf in jax.tree.leaves(initial))
+            told = json.dumps([tables, self.trainer, self.seed], sort_keys=True).encode()
+            known = cache / hashlib.sha256(told + start).hexdigest()[:24]
+            if known.exists():
+                shutil.copytree(known, folder, dirs_exist_ok=True)
+                run = json.loads((folder / "run.json").read_text(encoding="utf-8"))
+                return load_policy(folder / "policy.safetensors"), run["seconds"]
+            policy, seconds = super().learn(task, initial, folder, number)
+            self.spent += seconds
+            part = known.with_name(f"{known.name}-{os.getpid()}")
+            part.mkdir(parents=True)
+            for name in ("policy.safetensors", "run.json"):
+                shutil.copyfile(folder / name, part / name)
+            if known.exists():  # the other process was faster
+                shutil.rmtree(part)
+            else:
+                part.rename(known)
+            return policy, seconds
+
+    cache = folder / "cache"
+    time_wanted, overshoot, error, more, fixed = GRID[index]
+    requirement = make_requirement(time_wanted, overshoot, error, **more)
     work = folder / "work" / f"{name_of(index)}-{method}-{seed}"
     shutil.rmtree(work, ignore_errors=True)
     began, said = time.monotonic(), []
     row: dict[str, Any] = {"requirement": name_of(index), "method": method, "seed": seed}
     try:
-        if method == "tuner":
-            result = tune(requirement, load_rules(), work, edits=fixed, seed=seed, most_steps=BUDGET, tell=said.append)
-            row |= {"met": result.met, "trainings": sum(step.edit is not None for step in result.steps)}
-            row |= {"blocked": result.blocked, "last": said[-2]}
-        else:
-            row |= search(requirement, fixed, method, seed, work, folder / "cache")
-    except BadInput as error:
-        row |= {"refused": str(error)}
-    row["seconds"] = round(time.monotonic() - began, 1)
+        tuner = CachedTuner(
+            requirement, load_rules(), work, task=None, edits=fixed, seed=seed, trainer="apg", most_steps=BUDGET,
+            tell=said.append, on_progress=None,
+        )  # fmt: skip
+    except BadInput as refusal:
+        row |= {"refused": str(refusal), "seconds": round(time.monotonic() - began, 1)}
+    else:
+        met = tuner.run().met if method == "tuner" else search(tuner, method, seed)
+        trainings = [step.seconds for step in tuner.steps[1:]]
+        elsewhere = time.monotonic() - began - tuner.spent
+        row |= {"met": met, "trainings": len(trainings), "seconds": round(elsewhere + sum(trainings), 1), "said": said}
     shutil.rmtree(work, ignore_errors=True)
     path = folder / f"{name_of(index)}-{method}-{seed}.json"
     whole = path.with_suffix(".part")
-    whole.write_text(json.dumps(row), encoding="utf-8")
+    whole.write_text(json.dumps(row, indent=1), encoding="utf-8")
     whole.replace(path)
-    print(json.dumps(row), flush=True)
+    print(path.stem, row.get("met", "refused"), row.get("trainings", ""), f"{row['seconds']} s", flush=True)
 
 
-def search(requirement: Any, fixed: dict, method: str, seed: int, work: Path, cache: Path) -> dict[str, Any]:
-    """Optuna over the fields of the rules, from the policy the tuner begins with, until met or out of budget."""
+def search(tuner: Any, method: str, seed: int) -> bool:
+    """Whether Optuna meets what the tuner is asked for, from the policy the tuner begins with, within the budget."""
     import optuna
 
-    from flytune.task.task import write_task
-    from flytune.tune.requirement import MARGIN, Measured
-    from flytune.tune.rules import field_of, load_rules
-    from flytune.tune.search import Tuner
+    from flytune.tune.requirement import MARGIN
+    from flytune.tune.rules import field_of
 
     optuna.logging.set_verbosity(optuna.logging.WARNING)
-    tuner = Tuner(
-        requirement, load_rules(), work, task=None, edits=fixed, seed=seed, trainer="apg", most_steps=BUDGET,
-        tell=lambda line: None, on_progress=None,
-    )  # fmt: skip
+    requirement = tuner.requirement
     ranges = {
         rule.field: tuple(map(float, rule.range))
         for rule in tuner.rules
         if rule.field
-        and rule.field not in fixed
-        and not rule.field.startswith("apg.")
+        and rule.field not in tuner.fixed
+        and rule.field.split(".")[0] not in ("apg", "ppo")
         and field_of(tuner.tables, rule.field)
     }
-    tuner._begin()
-    if not requirement.misses(tuner.steps[0].measured, MARGIN) and not tuner._verdict(tuner.steps[0]).misses:
-        return {"met": True, "trainings": 0}
+    tuner.begin()
     samplers = {
         "tpe": optuna.samplers.TPESampler(seed=seed, n_startup_trials=4),
         "random": optuna.samplers.RandomSampler(seed),
@@ -127,28 +167,16 @@ def search(requirement: Any, fixed: dict, method: str, seed: int, work: Path, ca
             value=requirement.distance(tuner.steps[0].measured),
         )
     )
-    for number in range(1, BUDGET + 1):
+    while True:
+        step = tuner.steps[-1]
+        if not requirement.misses(step.measured, MARGIN) and not tuner.verdict(step).misses:
+            return True
+        if len(tuner.steps) > BUDGET:
+            return False
         trial = study.ask()
         values = {name: trial.suggest_float(name, low, high, log=True) for name, (low, high) in ranges.items()}
-        reasons = dict.fromkeys(values, method)
-        text = write_task(dataclasses.replace(tuner.task_of(values, reasons), name="")).replace(method, "")
-        key = hashlib.sha256(f"{tuner.start} {seed} {tuner.duration} {text}".encode()).hexdigest()[:24]
-        known = cache / key
-        if (known / "measured.json").exists():
-            measured = Measured.from_dict(json.loads((known / "measured.json").read_text(encoding="utf-8")))
-            step = dataclasses.replace(tuner.steps[0], number=number, values=values, reasons=reasons, measured=measured)
-            shutil.copytree(known, work / "steps" / f"{number:02d}")
-            tuner.steps.append(step)
-        else:
-            tuner._train(number, values, reasons, None, 0)
-            step = tuner.steps[-1]
-            known.mkdir(parents=True, exist_ok=True)
-            shutil.copyfile(work / "steps" / f"{number:02d}" / "policy.safetensors", known / "policy.safetensors")
-            (known / "measured.json").write_text(json.dumps(step.measured.to_dict()), encoding="utf-8")
-        study.tell(trial, requirement.distance(step.measured))
-        if not requirement.misses(step.measured, MARGIN) and not tuner._verdict(step).misses:
-            return {"met": True, "trainings": number}
-    return {"met": False, "trainings": BUDGET}
+        tuner.train(len(tuner.steps), values, dict.fromkeys(values, method), None, 0)
+        study.tell(trial, requirement.distance(tuner.steps[-1].measured))
 
 
 def summary(folder: Path) -> str:
@@ -157,36 +185,39 @@ def summary(folder: Path) -> str:
 
     rows = [json.loads(path.read_text(encoding="utf-8")) for path in sorted(folder.glob("*-*.json"))]
     methods = [method for method in ("tuner", "tpe", "random") if any(row["method"] == method for row in rows)]
-    tried = [{row["requirement"] for row in rows if row["method"] == method} for method in methods]
-    shared = set.intersection(*tried)
+    shared = set.intersection(*({row["requirement"] for row in rows if row["method"] == m} for m in methods))
     groups = [("tuner, all seeds", [row for row in rows if row["method"] == "tuner"])]
     first = [row for row in rows if row["seed"] == 0 and row["requirement"] in shared]
     groups += [(f"{method}, seed 0", [row for row in first if row["method"] == method]) for method in methods]
-    lines = ["| | met | trainings until met, median [95 % interval] | seconds, median |", "|---|---|---|---|"]
+    hard = {row["requirement"] for row in rows if row["method"] == "tuner" and row.get("trainings")}
+    groups += [
+        (f"{title}, where the start does not do", [row for row in chosen if row["requirement"] in hard])
+        for title, chosen in groups
+    ]
+    lines = [
+        "| | met | trainings until met, median [95 % interval] | seconds until met, median [95 % interval] |",
+        "|---|---|---|---|",
+    ]
     for title, chosen in groups:
         mine = [row for row in chosen if "refused" not in row]
-        needed = [float(row["trainings"]) if row["met"] else float("inf") for row in mine]
-        seconds = sorted(row["seconds"] for row in mine)
-        low, high = bootstrap_interval([needed])
-        middle = sorted(needed)[(len(needed) - 1) // 2]
-        told = " to ".join("never" if end is None else f"{end:g}" for end in (low, high))
-        median = f"{middle:g}" if middle < float("inf") else "never"
-        lines.append(
-            f"| {title} | {sum(row['met'] for row in mine)} of {len(mine)} | {median} [{told}] | "
-            f"{seconds[len(seconds) // 2]:.0f} |"
-        )
-    lines += ["", f"| requirement | {' | '.join(methods)} |", f"|---|{'---|' * len(methods)}"]
+        cells = []
+        for name in ("trainings", "seconds"):
+            needed = [float(row[name]) if row["met"] else math.inf for row in mine]
+            low, high = bootstrap_interval([needed])
+            middle = sorted(needed)[(len(needed) - 1) // 2]
+            told = ["never" if end is None or math.isinf(end) else f"{end:.0f}" for end in (middle, low, high)]
+            cells.append(f"{told[0]} [{told[1]} to {told[2]}]")
+        lines.append(f"| {title} | {sum(row['met'] for row in mine)} of {len(mine)} | {' | '.join(cells)} |")
+    lines += ["", 'Trainings of each seed; "-": not met with twelve.', ""]
+    lines += [f"| requirement | {' | '.join(methods)} |", f"|---|{'---|' * len(methods)}"]
     for index in range(len(GRID)):
         cells = []
         for method in methods:
             mine = [row for row in rows if row["method"] == method and row["requirement"] == name_of(index)]
             cells.append(
-                ", ".join("refused" if "refused" in r else f"{r['trainings']}" if r["met"] else "not met" for r in mine)
+                ", ".join("refused" if "refused" in r else f"{r['trainings']}" if r["met"] else "-" for r in mine)
             )
-        time, overshoot, error, at_most, fixed = GRID[index]
-        bound = "".join(f", at most {value:g} m/s" for value in fixed.values())
-        said = f"{'at most ' if at_most else ''}{time:g} s, {overshoot:g} %, {1e3 * error:g} mm{bound}"
-        lines.append(f"| {said} | {' | '.join(cells)} |")
+        lines.append(f"| {title_of(index)} | {' | '.join(cells)} |")
     return "\n".join(lines) + "\n"
 
 

@@ -188,6 +188,15 @@ def allowed(annotation: Any) -> str:
     return ", ".join(part for part in (number, text) if part)
 
 
+def unit_of(kind: Any, data: Mapping[str, Any], path: str) -> str:
+    """The unit of the field at a dotted path of a dataclass's tables; empty where it has none, or there is no field."""
+    annotation, node = kind, data
+    for name in path.split("."):
+        annotation = _step(annotation, name, node)
+        node = node.get(name, {}) if isinstance(node, Mapping) else {}
+    return "" if annotation is None else _unit(annotation, "")
+
+
 def nearest(name: str, options: Iterator[str] | list[str]) -> str | None:
     """The option spelled most like `name`, or None where nothing is near."""
     found = difflib.get_close_matches(name, list(options), n=1, cutoff=0.6)

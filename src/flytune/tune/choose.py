@@ -5,58 +5,18 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from flytune.tune.effects import Effects
-from flytune.tune.requirement import MARGIN, Measured, Requirement
-from flytune.tune.rules import CONDITIONS, Rule, conditions, field_of, moved
+from flytune import document
+from flytune.task.task import Task
+from flytune.tune.effects import FLOOR, Effects
+from flytune.tune.requirement import MARGIN, Requirement
+from flytune.tune.rules import Rule, conditions, field_of, is_fixed, moved
+from flytune.tune.step import HALF_WAY, Edit, Step
 
-# what is cured first where several things are missing
-URGENCY = {"unsettled": 1.3, "breaks a bound": 1.1, "too slow": 1.0, "too fast": 1.0, "overshoots": 0.8, "inexact": 0.8}
-TRUST = {"flown": 1.0, "map": 0.9, "rule": 0.6}  # in a slope, by where it comes from
+TRUST = {"between": 1.0, "flown": 1.0, "map": 0.9, "rule": 0.6}  # in a slope, by where it comes from
 EFFORT = 0.1  # what a factor of e costs: of two edits that promise the same, the smaller
-HALF_WAY = "back half-way"
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class Edit:
-    """One change of one field, and what it is for."""
-
-    rule: str
-    source: str
-    says: str
-    condition: str
-    field: str
-    before: float
-    after: float
-    expects: float | None  # of the rule's measure; None where no number can be promised
-    known_from: str  # flown, map or rule
-
-    @property
-    def measure(self) -> str:
-        """What it is to change."""
-        return CONDITIONS[self.condition][0]
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class Step:
-    """One policy of the loop: the edits it was trained with, and how it flies."""
-
-    number: int
-    values: Mapping[str, float]  # field -> value, of every edit so far
-    reasons: Mapping[str, str]  # field -> why
-    edit: Edit | None  # the last of them; None for the policy the loop began with
-    origin: int | None  # the number of the step that was edited
-    measured: Measured
-    seconds: float  # of training
-
-    def to_dict(self) -> dict[str, Any]:
-        """Plain values."""
-        return dataclasses.asdict(self) | {"measured": self.measured.to_dict()}
-
-    @classmethod
-    def from_dict(cls, data: dict[str, Any]) -> "Step":
-        """The inverse of `to_dict`."""
-        edit = Edit(**data["edit"]) if data["edit"] else None
-        return cls(**{**data, "edit": edit, "measured": Measured.from_dict(data["measured"])})
+SAME = 0.01  # two values of a field nearer than this share are the same
+HARM = 0.5  # what it costs to push another measure over its bound
+MEASURES = ("settling_time", "overshoot", "error")  # that the effect map knows
 
 
 @dataclasses.dataclass(frozen=True)
@@ -70,6 +30,12 @@ class _Case:
     effects: Effects
     fixed: Sequence[str]
     margin: float
+    trainer: str
+
+    @property
+    def mapped(self) -> bool:
+        """Whether the effect map is of this trainer, so that an effect it did not find is not there."""
+        return self.trainer == self.effects.facts.get("trainer", "apg")
 
 
 def choose(
@@ -80,6 +46,7 @@ def choose(
     effects: Effects,
     fixed: Sequence[str],
     margin: float = MARGIN,
+    trainer: str = "apg",
 ) -> tuple[Step, Edit] | list[str]:
     """The step to go on from and its edit; where no rule can help, why not, one line for each that was looked at.
 
@@ -91,48 +58,68 @@ def choose(
         effects: what each knob was measured to do.
         fixed: field paths the user has set; they, and what lies under them, are not touched.
         margin: the share of the tolerance that counts as met.
+        trainer: apg or ppo; rules for settings of the other are left out.
     """
-    case = _Case(steps, tables, requirement, rules, effects, fixed, margin)
-    last = steps[-1]
-    if (edit := _half_way(steps, requirement)) is not None:
-        return steps[last.origin or 0], edit
-    ranked = sorted(steps, key=lambda step: (_distance(step, requirement, margin), -step.number))
-    refused: list[str] = []
-    for origin in dict.fromkeys(step.number for step in (ranked[0], last)):
-        step = steps[origin]
-        found = _best_edit(case, step, refused)
-        if found is not None:
-            return step, found
-    return refused
+    case = _Case(steps, tables, requirement, rules, effects, fixed, margin, trainer)
+    if (edit := _half_way(case)) is not None:
+        return steps[steps[-1].origin or 0], edit
+    nearest = min(steps, key=lambda step: (_left(case, step), -step.number))
+    options: list[tuple[float, int, Edit]] = []
+    refused: dict[str, list[str]] = {}
+    for step in steps:
+        found, why_not = _options(case, step)
+        options += [(left, -step.number, edit) for left, edit in found]
+        refused = why_not if step is nearest else refused
+    if not options:
+        return [f"{condition}: {', '.join(reasons)}" for condition, reasons in refused.items()]
+    options.sort(key=lambda option: option[:2])
+    _, number, best = options[0]
+    second = next((edit for _, other, edit in options if other == number and edit.field != best.field), None)
+    return steps[-number], dataclasses.replace(best, second=second)
 
 
-def _best_edit(case: _Case, step: Step, refused: list[str]) -> Edit | None:
+def _left(case: _Case, step: Step) -> float:
+    """How far a step is from what is wanted."""
+    return sum(case.requirement.parts(step.measured, case.margin).values())
+
+
+def _options(case: _Case, step: Step) -> tuple[list[tuple[float, Edit]], dict[str, list[str]]]:
+    """The edits of a step that promise more than they cost, each with how far it is expected to be then; and by
+    condition, why not the others."""
+    parts = case.requirement.parts(step.measured, case.margin)
     misses = case.requirement.misses(step.measured, case.margin)
-    options: list[tuple[float, Edit]] = []
+    found: list[tuple[float, Edit]] = []
+    refused: dict[str, list[str]] = {}
     for condition in conditions(misses):
         for rule in case.rules:
             if rule.advice or rule.when != condition:
                 continue
-            edit, gain = _edit(case, rule, step, misses)
+            edit, worth = _edit(case, rule, step, misses)
             if isinstance(edit, str):
-                refused.append(f"{condition}: {rule.name}: {edit}")
+                refused.setdefault(condition, []).append(f"{rule.name} ({edit})")
             else:
-                options.append((URGENCY[condition] * gain, edit))
-    return max(options, key=lambda option: option[0])[1] if options else None
+                found.append((sum(parts.values()) - parts[rule.measure] * worth, edit))
+    return found, refused
 
 
 def _edit(case: _Case, rule: Rule, step: Step, misses: Mapping[str, float]) -> tuple[Edit | str, float]:
-    """The edit a rule asks for and its gain, the share of what is missing that it promises; or why it is not used."""
-    if any(rule.field == path or rule.field.startswith(f"{path}.") for path in case.fixed):
+    """The edit a rule asks for and its worth: the share that it promises of what is missing, as far as that can be
+    trusted, less what it costs. Or why the rule is not used."""
+    axis = case.requirement.axis
+    if rule.field.split(".")[0] in {"apg", "ppo"} - {case.trainer}:
+        return f"{rule.field} is of another trainer", 0.0
+    if is_fixed(rule.field, case.fixed):
         return f"{rule.field} is set by the user", 0.0
     value = step.values.get(rule.field) or field_of(dict(case.tables), rule.field)
     if not value or value <= 0:
         return f"the task has no {rule.field}, or it is 0", 0.0
     if missed := [measure for measure in rule.spares if measure in misses and measure != rule.measure]:
-        return f"forbidden while {', '.join(missed)} is missed", 0.0
+        return f"not while the {' and the '.join(missed).replace('_', ' ')} is missed", 0.0
     if _disappointed(rule, case.steps):
         return "it was tried, and did not help", 0.0
-    slope, known_from = _slope(rule, value, step, case.steps, case.effects)
+    if case.mapped and not case.effects.moves(rule.field, axis):
+        return "measured to move nothing", 0.0
+    slope, known_from = _slope(case, rule, value, step)
     if slope is None:
         return known_from, 0.0
     aim = math.nan if rule.measure in ("settled", "kept") else _aim(rule.measure, case.requirement, case.margin)
@@ -145,12 +132,16 @@ def _edit(case: _Case, rule: Rule, step: Step, misses: Mapping[str, float]) -> t
         wanted = math.log(aim / max(now, 1e-9))
         factor = math.exp(max(-3.0, min(3.0, wanted / slope)))
         bracketed = _between(rule, step, case.steps, aim) if rule.measure == "settling_time" else None
-        after = moved(rule, value, bracketed / value if bracketed else factor)
+        if bracketed and abs(math.log(bracketed / value)) > 1e-9:
+            factor, slope, known_from = bracketed / value, wanted / math.log(bracketed / value), "between"
+        after = moved(rule, value, factor)
         promised = slope * math.log(after / value)
         gain = min(1.0, promised / wanted) if wanted else 0.0
         expects = now * math.exp(promised)
     if (after - value) * up <= 0 or abs(after / value - 1) < 0.002:
         return f"{rule.field} is at {value:g}, the end of its range", 0.0
+    if (twin := _twin(case, step, rule.field, after)) is not None:
+        return f"{rule.field} {after:g} was flown in step {twin.number}", 0.0
     edit = Edit(
         rule=rule.name,
         source=rule.source,
@@ -159,11 +150,16 @@ def _edit(case: _Case, rule: Rule, step: Step, misses: Mapping[str, float]) -> t
         field=rule.field,
         before=value,
         after=after,
+        unit=document.unit_of(Task, case.tables, rule.field),
         expects=expects,
+        slope=slope,
         known_from=known_from,
     )
-    cost = EFFORT * abs(math.log(after / value)) + _harm(case, edit, step, rule.measure, misses)
-    return edit, gain * TRUST[known_from] - cost
+    harmed = _harmed(case, edit, step, misses)
+    worth = gain * TRUST[known_from] - EFFORT * abs(math.log(after / value)) - HARM * len(harmed)
+    if worth <= 0:
+        return f"would break the {' and the '.join(harmed)}" if harmed else "promises too little", 0.0
+    return edit, worth
 
 
 def _aim(measure: str, requirement: Requirement, margin: float) -> float:
@@ -179,6 +175,15 @@ def _alike(first: Step, second: Step, field: str) -> bool:
     return all(first.values.get(name) == second.values.get(name) for name in names)
 
 
+def _twin(case: _Case, step: Step, field: str, value: float) -> Step | None:
+    """A step that had this value of the field, and all else as this step has it."""
+    for other in case.steps:
+        there = _value(other, field, case.steps)
+        if there is not None and _alike(step, other, field) and abs(math.log(there / value)) < SAME:
+            return other
+    return None
+
+
 def _value(step: Step, field: str, steps: Sequence[Step]) -> float | None:
     """The field's value in a step; before its first edit, what that edit found."""
     if field in step.values:
@@ -186,11 +191,11 @@ def _value(step: Step, field: str, steps: Sequence[Step]) -> float | None:
     return next((each.edit.before for each in steps if each.edit and each.edit.field == field), None)
 
 
-def _slope(rule: Rule, value: float, step: Step, steps: Sequence[Step], effects: Effects) -> tuple[float | None, str]:
+def _slope(case: _Case, rule: Rule, value: float, step: Step) -> tuple[float | None, str]:
     """d log(measure) / d log(field) and where it is known from; None and the reason where the rule does not hold."""
     flown = []
-    for other in steps:
-        there = _value(other, rule.field, steps)
+    for other in case.steps:
+        there = _value(other, rule.field, case.steps)
         if other is step or there is None or not _alike(step, other, rule.field) or abs(math.log(there / value)) < 0.02:
             continue
         now, then = (getattr(each.measured, rule.measure) for each in (step, other))
@@ -200,17 +205,14 @@ def _slope(rule: Rule, value: float, step: Step, steps: Sequence[Step], effects:
         found = min(flown)[1]
         if found * rule.slope > 0 and abs(found) > 0.1 * abs(float(rule.slope)):
             return found, "flown"
-    measured = effects.elasticity(rule.field, rule.measure, value) if rule.measure in MEASURES else None
-    if measured is None:
+    what = (rule.field, rule.measure, value, case.requirement.axis, rule.direction == "up")
+    measured = case.effects.elasticity(*what) if rule.measure in MEASURES else None
+    if measured is not None and measured * rule.slope > 0 and case.effects.matters(*what):
+        return measured, "map"
+    if measured is None or not case.mapped:
         return float(rule.slope), "rule"
-    if not effects.matters(rule.field, rule.measure, value):
-        return None, "measured to have no effect there"
-    if measured * float(rule.slope) <= 0:
-        return None, "measured to have the opposite effect there"
-    return measured, "map"
-
-
-MEASURES = ("settling_time", "overshoot", "error")  # that the effect map knows
+    nothing = not case.effects.matters(*what)
+    return None, f"measured to have {'no effect' if nothing else 'the opposite effect'} there"
 
 
 def _between(rule: Rule, step: Step, steps: Sequence[Step], aim: float) -> float | None:
@@ -248,44 +250,53 @@ def _disappointed(rule: Rule, steps: Sequence[Step]) -> bool:
     return (now - before) / (expects - before) < 0.1 if expects != before else False
 
 
-def _harm(case: _Case, edit: Edit, step: Step, own: str, misses: Mapping[str, float]) -> float:
-    """What the edit is measured to cost in the other measures: a half for each it pushes over its bound."""
-    cost = 0.0
-    for measure in MEASURES:
-        if measure == own or measure in misses:
-            continue
-        slope = case.effects.elasticity(edit.field, measure, edit.before)
-        if slope is None or not case.effects.matters(edit.field, measure, edit.before):
-            continue
-        now = max(getattr(step.measured, measure), 0.002 if measure == "overshoot" else 1e-6)
-        then = dataclasses.replace(
-            step.measured, **{measure: now * math.exp(slope * math.log(edit.after / edit.before))}
-        )
-        cost += 0.5 * (measure in case.requirement.misses(then))
-    return cost
+def _harmed(case: _Case, edit: Edit, step: Step, misses: Mapping[str, float]) -> list[str]:
+    """The other measures that the edit is known to push over their bounds: by the step flown nearest to where it goes,
+    or else by the effect map."""
+    nearby = _nearby(case, edit, step)
+    if nearby is not None:
+        found = [name for name in case.requirement.misses(nearby.measured) if name != edit.measure]
+    else:
+        found = [name for name in MEASURES if name != edit.measure and _mapped_miss(case, edit, step, name)]
+    return [name.replace("_", " ") for name in found if name not in misses]
 
 
-def _half_way(steps: Sequence[Step], requirement: Requirement) -> Edit | None:
+def _nearby(case: _Case, edit: Edit, step: Step) -> Step | None:
+    """The step that differs in the edit's field alone and is nearest to the edit's value, nearer than its origin is."""
+    away = {step.number: abs(math.log(edit.after / edit.before))}
+    for other in case.steps:
+        there = _value(other, edit.field, case.steps)
+        if other is not step and there is not None and _alike(step, other, edit.field):
+            away[other.number] = abs(math.log(edit.after / there))
+    nearest = min(away, key=away.__getitem__)
+    return None if nearest == step.number else case.steps[nearest]
+
+
+def _mapped_miss(case: _Case, edit: Edit, step: Step, measure: str) -> bool:
+    """Whether a measure misses its bound after the edit, by the slope of the effect map."""
+    what = (edit.field, measure, edit.before, case.requirement.axis, edit.after > edit.before)
+    slope = case.effects.elasticity(*what)
+    if slope is None or not case.effects.matters(*what):
+        return False
+    now = max(getattr(step.measured, measure), FLOOR[measure])
+    then = now * math.exp(slope * math.log(edit.after / edit.before))
+    return measure in case.requirement.misses(dataclasses.replace(step.measured, **{measure: then}))
+
+
+def _half_way(case: _Case) -> Edit | None:
     """Where the last edit lost trials that had settled: half of it, from where it was made."""
-    last = steps[-1]
+    last = case.steps[-1]
     if last.edit is None or last.origin is None:
         return None
-    origin = steps[last.origin]
-    lost = requirement.misses(last.measured).get("settled", 0.0)
-    if lost > -0.05 or requirement.misses(origin.measured).get("settled", 0.0) < lost / 2:
+    origin = case.steps[last.origin]
+    lost = case.requirement.misses(last.measured).get("settled", 0.0)
+    if lost > -0.05 or case.requirement.misses(origin.measured).get("settled", 0.0) < lost / 2:
         return None
     before, after = last.edit.before, last.edit.after
     middle = float(f"{math.sqrt(before * after):.3g}")
-    if abs(math.log(middle / before)) < 0.03:
+    if abs(math.log(middle / before)) < 0.03 or _twin(case, origin, last.edit.field, middle) is not None:
         return None
     return dataclasses.replace(
-        last.edit, rule=HALF_WAY, source="flytune", after=middle, expects=None,
+        last.edit, rule=HALF_WAY, source="flytune", after=middle, expects=None, second=None,
         says=f"after {last.edit.rule} only {last.measured.settled:.0%} of the trials settled",
     )  # fmt: skip
-
-
-def _distance(step: Step, requirement: Requirement, margin: float) -> float:
-    narrowed = dataclasses.replace(
-        requirement, overshoot=margin * requirement.overshoot, error=margin * requirement.error
-    )
-    return narrowed.distance(step.measured)

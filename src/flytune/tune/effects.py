@@ -25,6 +25,16 @@ class Flown:
     error: float | None  # m, median of the position
     details: Mapping[str, Any]  # per axis, yaw error, violations, crashes
 
+    def number(self, measure: str, axis: str = "position") -> float:
+        """A measure of the position or of an axis, +inf where too few trials have it; x, y and z share its error."""
+        if axis == "position" or (measure == "error" and axis != "yaw"):
+            value = getattr(self, measure)
+        elif measure == "error":
+            value = self.details.get("yaw_error")
+        else:
+            value = self.details.get(f"{measure}_axes", {}).get(axis)
+        return math.inf if value is None else float(value)
+
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Point:
@@ -33,19 +43,18 @@ class Point:
     value: float
     seeds: Sequence[Flown]
 
-    def numbers(self, measure: str) -> list[float]:
+    def numbers(self, measure: str, axis: str = "position") -> list[float]:
         """The measure of each seed, +inf where there is none."""
-        found = (getattr(flown, measure) for flown in self.seeds)
-        return [math.inf if value is None else float(value) for value in found]
+        return [flown.number(measure, axis) for flown in self.seeds]
 
-    def middle(self, measure: str) -> float:
+    def middle(self, measure: str, axis: str = "position") -> float:
         """The median over seeds."""
-        return float(np.median(self.numbers(measure)))
+        return float(np.median(self.numbers(measure, axis)))
 
-    def spread(self, measure: str) -> float:
-        """Largest less smallest over seeds, +inf where a seed has none."""
-        numbers = self.numbers(measure)
-        return max(numbers) - min(numbers) if all(map(math.isfinite, numbers)) else math.inf
+    def apart(self, other: "Point", measure: str, axis: str = "position") -> bool:
+        """Whether every seed of one of the two values lies beyond every seed of the other."""
+        mine, others = self.numbers(measure, axis), other.numbers(measure, axis)
+        return max(mine) < min(others) or max(others) < min(mine)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -55,10 +64,14 @@ class Curve:
     baseline: float
     points: Sequence[Point]
 
-    def around(self, value: float) -> tuple[Point, Point]:
-        """The two measured values that bracket a value; the outermost two beyond the ends. Values of 0 are left out."""
+    def around(self, value: float, up: bool = True) -> tuple[Point, Point]:
+        """The two measured values between which a knob moves that leaves `value` upwards, or downwards.
+
+        The outermost two beyond the ends. Values of 0 are left out.
+        """
         points = [point for point in self.points if point.value > 0]
-        upper = next((index for index, point in enumerate(points) if point.value > value), len(points) - 1)
+        beyond = [point.value > value if up else point.value >= value for point in points]
+        upper = beyond.index(True) if True in beyond else len(points) - 1
         upper = max(1, upper)
         return points[upper - 1], points[upper]
 
@@ -70,43 +83,51 @@ class Effects:
     facts: Mapping[str, Any]  # command, base task, updates, trials, duration, seeds, versions
     knobs: Mapping[str, Curve]  # field path -> curve
 
-    def elasticity(self, path: str, measure: str, value: float) -> float | None:
-        """d log(measure) / d log(knob) between the two measured values around `value`, of the medians over seeds.
+    def elasticity(
+        self, path: str, measure: str, value: float, axis: str = "position", up: bool = True
+    ) -> float | None:
+        """d log(measure) / d log(knob) between the two values around `value`, of the medians over seeds.
 
         None where the knob was not measured, or one of the two has no finite median.
         """
         if path not in self.knobs:
             return None
-        low, high = self.knobs[path].around(value)
-        first, second = (max(point.middle(measure), FLOOR[measure]) for point in (low, high))
+        low, high = self.knobs[path].around(value, up)
+        first, second = (max(point.middle(measure, axis), FLOOR[measure]) for point in (low, high))
         if not (math.isfinite(first) and math.isfinite(second)):
             return None
         return math.log(second / first) / math.log(high.value / low.value)
 
-    def matters(self, path: str, measure: str, value: float) -> bool:
-        """Whether the two medians around `value` are farther apart than the seeds of either; True where unmeasured."""
+    def matters(self, path: str, measure: str, value: float, axis: str = "position", up: bool = True) -> bool:
+        """Whether the seeds of the two values around `value` are apart; True where the knob was not measured."""
         if path not in self.knobs:
             return True
-        low, high = self.knobs[path].around(value)
-        change = abs(high.middle(measure) - low.middle(measure))
-        return change > max(low.spread(measure), high.spread(measure))
+        low, high = self.knobs[path].around(value, up)
+        return low.apart(high, measure, axis)
+
+    def moves(self, path: str, axis: str = "position") -> bool:
+        """Whether the knob moves anything, somewhere between its first and its last value; True where not measured."""
+        if path not in self.knobs:
+            return True
+        first, *others = self.knobs[path].points
+        return any(first.apart(other, measure, axis) for other in others for measure in FLOOR)
 
     def verdict(
-        self, path: str, measure: str, direction: Literal["up", "down"]
+        self, path: str, measure: str, direction: Literal["up", "down"], axis: str = "position"
     ) -> Literal["confirmed", "wrong sign", "no effect", "only beyond a threshold"]:
         """What became of the claim that raising the knob moves the measure in `direction`, from the whole curve.
 
         No effect: from the first to the last value with a finite median the measure changes by less than 10 % (0.005
-        for the overshoot), or by less than the seeds differ. Only beyond a threshold: one interval between neighbours
-        carries at least 80 % of the change. A value where nothing settles is left out.
+        for the overshoot), or the seeds of the two are not apart. Only beyond a threshold: one interval between
+        neighbours carries at least 80 % of the change. A value where nothing settles is left out.
         """
-        points = [point for point in self.knobs[path].points if math.isfinite(point.middle(measure))]
+        points = [point for point in self.knobs[path].points if math.isfinite(point.middle(measure, axis))]
         if len(points) < 2:
             return "no effect"
-        middles = [point.middle(measure) for point in points]
+        middles = [point.middle(measure, axis) for point in points]
         change = middles[-1] - middles[0]
         least = NOTHING[measure] * (1.0 if measure == "overshoot" else min(middles))
-        if abs(change) < max(least, points[0].spread(measure), points[-1].spread(measure)):
+        if abs(change) < least or not points[0].apart(points[-1], measure, axis):
             return "no effect"
         if (change > 0) != (direction == "up"):
             return "wrong sign"

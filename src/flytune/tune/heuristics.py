@@ -16,30 +16,30 @@ MEASURES = (
     ("error", "error [mm]", 1e3),
 )
 
-# item, claim, knob, measure, which way the measure is to go where the knob is raised
+# item, claim, knob, measure, which way the measure is to go where the knob is raised, of what
 CLAIMS = (
-    ("H1, H2", "survival up: bolder, faster", "reward.survival.reward", "settling_time", "down"),
-    ("H3", "horizontal delta up: faster", "reward.horizontal.wide", "settling_time", "down"),
-    ("H3", "vertical sharpness up: faster", "reward.vertical.sharpness", "settling_time", "down"),
-    ("H4", "share of the wide term up: less accurate", "reward.horizontal.share", "error", "up"),
-    ("H5", "sharper beta: more accurate", "reward.horizontal.narrow", "error", "down"),
-    ("H6", "velocity weight up: slower", "reward.velocity.weight", "settling_time", "up"),
-    ("H6", "velocity weight up: damped", "reward.velocity.weight", "overshoot", "down"),
-    ("H6", "velocity sharpness up: slower", "reward.velocity.sharpness", "settling_time", "up"),
-    ("H6", "velocity sharpness up: damped", "reward.velocity.sharpness", "overshoot", "down"),
-    ("H7", "speed bound up: faster", "termination.speed.bound", "settling_time", "down"),
-    ("H8", "smoothness weight up: larger error", "reward.smoothness.weight", "error", "up"),
-    ("H8, H9", "rate bound up: smaller error", "termination.body_rate.bound_deg_per_s", "error", "down"),
+    ("H1, H2", "survival up: bolder, faster", "reward.survival.reward", "settling_time", "down", "position"),
+    ("H3", "horizontal delta up: faster", "reward.horizontal.wide", "settling_time", "down", "position"),
+    ("H3", "vertical delta up: faster in height", "reward.vertical.sharpness", "settling_time", "down", "z"),
+    ("H4", "share of the wide term up: less accurate", "reward.horizontal.share", "error", "up", "position"),
+    ("H5", "sharper beta: more accurate", "reward.horizontal.narrow", "error", "down", "position"),
+    ("H6", "velocity weight up: slower", "reward.velocity.weight", "settling_time", "up", "position"),
+    ("H6", "velocity weight up: damped", "reward.velocity.weight", "overshoot", "down", "position"),
+    ("H6", "velocity sharpness up: slower", "reward.velocity.sharpness", "settling_time", "up", "position"),
+    ("H6", "velocity sharpness up: damped", "reward.velocity.sharpness", "overshoot", "down", "position"),
+    ("H7", "speed bound up: faster", "termination.speed.bound", "settling_time", "down", "position"),
+    ("H8", "smoothness weight up: larger error", "reward.smoothness.weight", "error", "up", "position"),
+    ("H8, H9", "rate bound up: smaller error", "termination.body_rate.bound_deg_per_s", "error", "down", "position"),
 )
 
 
 def heuristics_tables(effects: Effects) -> str:
     """Verdict per claim, then one table per knob, as Markdown."""
     rows = []
-    for item, claim, knob, measure, direction in CLAIMS:
+    for item, claim, knob, measure, direction, axis in CLAIMS:
         points = effects.knobs[knob].points
-        ends = [_said(measure, point.middle(measure)) for point in (points[0], points[-1])]
-        verdict = effects.verdict(knob, measure, direction)  # pyright: ignore[reportArgumentType]
+        ends = [_said(measure, point.middle(measure, axis)) for point in (points[0], points[-1])]
+        verdict = effects.verdict(knob, measure, direction, axis)  # pyright: ignore[reportArgumentType]
         span = f"{points[0].value:g} to {points[-1].value:g}"
         rows.append((item, claim, f"`{knob}` {span}", f"{ends[0]} to {ends[1]}", f"**{verdict}**"))
     parts = ["## The paper's claims", _table(("item", "claim", "knob", "measured", "verdict"), rows), "## Every knob"]

@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -59,19 +60,24 @@ class Requirement:
         """The settling time in s to steer for."""
         return self.settling_time * (1.0 - self.tolerance / 2 if self.at_most else 1.0)
 
-    def measure(self, judgement: Judgement, fixed: tuple[str, ...] = ()) -> Measured:
-        """The measures of a judgement; `fixed` names the terminations the user has set."""
-        crossed = [judgement.violated[name] for name in fixed if name in judgement.violated]
-        broken = np.logical_or.reduce(crossed) if crossed else np.zeros(judgement.trials, bool)
-        times = judgement.settling_time[self.axis]
-        stepped = judgement.overshoot[self.axis]
+    def measure(self, *judgements: Judgement, fixed: tuple[str, ...] = ()) -> Measured:
+        """The measures of all the trials of one or more judgements; `fixed` names the terminations the user has set."""
+
+        def all_of(values: Callable[[Judgement], np.ndarray]) -> np.ndarray:
+            return np.concatenate([values(judgement) for judgement in judgements])
+
+        times = all_of(lambda judged: judged.settling_time[self.axis])
+        stepped = all_of(lambda judged: judged.overshoot[self.axis])
         stepped = stepped[~np.isnan(stepped)]
+        feasible = ~all_of(lambda judged: judged.infeasible)
+        crossed = [all_of(lambda judged, name=name: judged.violated[name]) for name in fixed]
+        broken = np.logical_or.reduce([np.zeros(len(times), bool), *crossed])
         return Measured(
             settling_time=_quantile(times, self.percentile / 100),
             overshoot=_quantile(stepped, 0.5) if stepped.size else 0.0,
-            error=_quantile(judgement.steady_state_error[self.axis], 0.5),
+            error=_quantile(all_of(lambda judged: judged.steady_state_error[self.axis]), 0.5),
             settled=float(np.mean(np.isfinite(times))),
-            kept=float(1 - np.mean(broken[~judgement.infeasible])) if not judgement.infeasible.all() else 1.0,
+            kept=float(1 - np.mean(broken[feasible])) if feasible.any() else 1.0,
         )
 
     def misses(self, measured: Measured, margin: float = 1.0) -> dict[str, float]:
@@ -95,11 +101,18 @@ class Requirement:
             found["error"] = math.log(measured.error / (margin * self.error))
         return found
 
+    def parts(self, measured: Measured, margin: float = 1.0) -> dict[str, float]:
+        """How far a response is from the requirement, by measure; empty where it is met.
+
+        In units that can be added: 1 is a settling time off by a factor of e, a fifth of the trials that do not
+        settle or break a bound, a fifth of the step too much overshoot, or an error too large by a factor of e^2.
+        """
+        sizes = {"settled": 5.0, "kept": 5.0, "settling_time": 1.0, "overshoot": 5.0, "error": 0.5}
+        return {name: sizes[name] * min(abs(size), 10.0) for name, size in self.misses(measured, margin).items()}
+
     def distance(self, measured: Measured) -> float:
         """One number for how far a response is from the requirement, 0 where it is met: to find the best of several."""
-        sizes = {"settled": 30.0, "kept": 10.0, "settling_time": 1.0, "overshoot": 5.0, "error": 0.5}
-        missed = self.misses(measured)
-        return sum(sizes[name] * min(abs(size), 10.0) for name, size in missed.items())
+        return sum(self.parts(measured).values())
 
     def to_dict(self) -> dict[str, Any]:
         """Plain numbers."""
@@ -108,12 +121,12 @@ class Requirement:
     def __str__(self) -> str:
         degrees = self.axis == "yaw"
         error = f"{math.degrees(self.error):.3g} deg" if degrees else f"{1e3 * self.error:.3g} mm"
-        time = (
-            f"at most {self.settling_time:g} s" if self.at_most else f"{self.settling_time:g} s +- {self.tolerance:.0%}"
-        )
+        tolerance = f"+- {100 * self.tolerance:g} %"
+        time = f"at most {self.settling_time:g} s" if self.at_most else f"{self.settling_time:g} s {tolerance}"
+        who = "median trial" if self.percentile == 50 else f"percentile {self.percentile:g} of the trials"
         return (
-            f"{self.axis} settles in {time} (percentile {self.percentile:g}), overshoot at most "
-            f"{100 * self.overshoot:g} %, error at most {error}, {self.settled:.0%} of the trials settled"
+            f"{self.axis} settles in {time} ({who}), overshoot at most {100 * self.overshoot:g} %, "
+            f"error at most {error} (both in the median), {100 * self.settled:g} % of the trials settle"
         )
 
 

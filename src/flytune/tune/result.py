@@ -4,8 +4,8 @@ import dataclasses
 from pathlib import Path
 from typing import Any
 
-from flytune.tune.choose import Step
-from flytune.tune.requirement import MARGIN, Requirement
+from flytune.tune.requirement import Requirement
+from flytune.tune.step import Step
 from flytune.tune.words import describe_edit, describe_miss, describe_step
 
 
@@ -38,14 +38,10 @@ class Tuning:
 
     def why(self) -> str:
         """What is missing of the best policy, and what stands in the way, in one line."""
-        best = self.steps[self.best]
-        missing = self.requirement.misses(best.measured, MARGIN) or next(
-            (verdict.misses for verdict in self.verdicts if verdict.step == self.best), {}
-        )
+        missing = next((verdict.misses for verdict in reversed(self.verdicts) if verdict.step == self.best), {})
         said = ", ".join(describe_miss(name, size, self.requirement) for name, size in missing.items())
-        return (
-            f"not met: {said}. " + ("; ".join(self.blocked) or "no rule can help") + f". Best kept in {self.directory}."
-        )
+        blocked = "; ".join(self.blocked) or "no rule can help"
+        return f"not met: {said} (step {self.best}). {blocked}. Best kept in {self.directory}."
 
     def to_dict(self) -> dict[str, Any]:
         """Plain values, for a page: `lines` is what was said of each step."""
@@ -56,7 +52,7 @@ class Tuning:
                 {
                     "number": step.number,
                     "origin": step.origin,
-                    "edit": describe_edit(step.edit) if step.edit else f"start: {self.start}",
+                    "edit": describe_edit(step.edit, self.requirement) if step.edit else f"start: {self.start}",
                     "response": describe_step(step, before, self.requirement),
                     "seconds": step.seconds,
                     "measured": step.measured.to_dict(),

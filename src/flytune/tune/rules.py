@@ -69,13 +69,6 @@ class Rule:
         return CONDITIONS[self.when][0]
 
 
-@pytree
-class RuleBook:
-    """All rules, in the order in which they are written."""
-
-    rule: tuple[Rule, ...]
-
-
 def load_rules(extra: Path | None = None) -> list[Rule]:
     """flytune's rules, and after them those of a TOML file of the user's own, which replace rules of the same name.
 
@@ -115,6 +108,11 @@ def field_of(task: dict[str, Any], path: str) -> float | None:
     for part in path.split("."):
         node = node.get(part) if isinstance(node, dict) else None
     return float(node) if isinstance(node, int | float) and not isinstance(node, bool) else None
+
+
+def is_fixed(path: str, fixed: Sequence[str]) -> bool:
+    """Whether the user has set a field, or a table above it."""
+    return any(path == each or path.startswith(f"{each}.") for each in fixed)
 
 
 def moved(rule: Rule, value: float, factor: float) -> float:

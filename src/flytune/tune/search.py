@@ -2,7 +2,6 @@
 
 import dataclasses
 import json
-import math
 import shutil
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -14,22 +13,19 @@ from flytune.control.policy import Policy, load_policy
 from flytune.errors import BadInput, Interrupted
 from flytune.learn.directory import write_text
 from flytune.learn.run import Progress, train
-from flytune.learn.shipped import shipped_files, shipped_names
-from flytune.response.fly import fly
-from flytune.response.judge import Judgement, judge
 from flytune.task.task import Task, load_task, preset_names, write_task
-from flytune.tune.choose import Edit, Step, choose
+from flytune.tune.choose import choose
 from flytune.tune.effects import load_effects
-from flytune.tune.limits import check_possible
-from flytune.tune.requirement import MARGIN, Requirement
+from flytune.tune.requirement import MARGIN, Measured, Requirement
 from flytune.tune.result import Tuning, Verdict
 from flytune.tune.rules import Rule
-from flytune.tune.words import describe, describe_edit, describe_step
+from flytune.tune.start import TUNING_SEED, TUNING_TRIALS, edited, find_start, fly_for, tuning_duration
+from flytune.tune.step import Edit, Step
+from flytune.tune.words import describe, describe_edit, describe_miss, describe_step, said_of
 
-TUNING_SEED, TUNING_TRIALS = 3000, 100  # the starts that are looked at again and again
 FRESH_SEED, FRESH_TRIALS = 4000, 200  # the starts of a verdict; each verdict has its own
 MOST_STEPS = 12
-STARTS = ("acrobatic-refined", "baseline-refined", "inspection-refined")  # known tasks, fastest first
+MOST_VERDICTS = 3  # on one step
 
 Tell = Callable[[str], None]
 
@@ -62,130 +58,133 @@ class Tuner:
             "requirement": requirement.to_dict(), "task": task, "edits": self.edits, "seed": seed,
             "trainer": trainer, "rules": [dataclasses.asdict(rule) for rule in rules],
         }  # fmt: skip
-        self.duration = math.ceil(max(10.0, 2.5 * requirement.settling_time))
+        self.duration = tuning_duration(requirement)
         self.effects = load_effects()
         self.steps: list[Step] = []
         self.verdicts: list[Verdict] = []
-        self.start, self.base, self.policy = self._nearest(task)
-        self.tables = document.plain(self.base)
-        self.bounds = tuple(path.split(".")[1] for path in self.fixed if path.startswith("termination."))
-
-    # what the loop begins with
-
-    def _nearest(self, wanted: str | None) -> tuple[str, Task, Policy | None]:
-        """The known task, with the user's edits, whose policy settles nearest to what is asked; and that policy."""
-        names = [wanted] if wanted else list(STARTS)
-        found: list[tuple[float, str, Task, Policy | None]] = []
-        for name in names:
-            task = load_task(name, self.edits)
-            policy = _shipped(name) if self.trainer == "apg" else None
-            if not found:
-                first = fly(policy or _nobody(), task, trials=TUNING_TRIALS, seed=TUNING_SEED, duration=0.6)
-                check_possible(task, self.requirement, first, self.fixed)
-            if policy is None:
-                found.append((math.inf, name, task, None))
-                continue
-            measured = self.requirement.measure(self._fly(policy, task, TUNING_SEED, TUNING_TRIALS))
-            usable = measured.settled >= 0.5 and math.isfinite(measured.settling_time)
-            away = abs(math.log(measured.settling_time / self.requirement.aim())) if usable else math.inf
-            found.append((away, name, task, policy if usable else None))
-        away, name, task, policy = min(found, key=lambda each: each[0])
-        if wanted is None and policy is None:
-            name = "baseline-refined"
-            task = load_task(name, self.edits)
-        named = dataclasses.replace(task, name=f"{task.name}-tuned-{self.requirement.settling_time:g}s")
-        return name, self._prepared(named, policy), policy
-
-    def _prepared(self, task: Task, policy: Policy | None) -> Task:
-        """The task with episodes as long as the response asked for, and a trainer that goes on from a policy."""
-        slow = self.requirement.settling_time >= 4
-        wanted: dict[str, tuple[Any, str]] = {
-            "horizon": (max(task.horizon, round(150 * self.requirement.settling_time)),
-                        "tuned: the episodes are longer than the response that is asked for"),
-            "duration": (float(self.duration), "tuned: trials of more than twice the settling time asked for"),
-        }  # fmt: skip
-        if self.trainer == "apg":
-            wanted["apg.leeway"] = (max(0.5, float(task.apg.leeway)), "tuned: as the refined presets")
-            if slow:
-                wanted["apg.window"] = (max(500, task.apg.window), "tuned: a slow response is seen whole")
-            if policy is not None:
-                wanted["apg.updates"] = (200, "tuned: it goes on from a policy that flies")
-                wanted["apg.learning_rate"] = (0.002, "tuned: it goes on from a policy that flies")
-        return _edited(task, {path: what for path, what in wanted.items() if not self._is_fixed(path)})
-
-    def _is_fixed(self, path: str) -> bool:
-        return any(path == fixed or path.startswith(f"{fixed}.") for fixed in self.fixed)
+        self.start = find_start(requirement, task, self.edits, trainer)
+        self.tables = document.plain(self.start.task)
+        self.bounds = tuple(
+            name
+            for name in self.start.task.termination
+            if any(path.startswith(f"termination.{name}.") for path in edits)
+        )
 
     # the loop
 
     def run(self) -> Tuning:
         """Steps until the requirement is met on fresh starts, or nothing can help."""
         self.tell(f"asked    {self.requirement}")
-        margin, blocked = MARGIN, []
+        self.tell(f"         on the tuning starts {100 * MARGIN:.0f} % of the tolerance and of the bounds is allowed, "
+                  "so that fresh starts do not disappoint")  # fmt: skip
         if not self.steps:
-            self._begin()
+            self.begin()
         else:
             for step in self.steps:
                 self._say(step)
         while True:
-            best = min(self.steps, key=lambda step: (self.requirement.distance(step.measured), step.number))
-            ready = [s for s in self.steps if not self.requirement.misses(s.measured, margin)]
-            ready = [s for s in ready if all(verdict.step != s.number for verdict in self.verdicts)]
+            self._look_again()
+            ready = [step for step in self.steps if self._is_ready(step)]
             if ready:
-                verdict = self._verdict(ready[-1])
-                if not verdict.misses:
+                if not self.verdict(ready[-1]).misses:
                     return self._end(ready[-1].number, [])
-                margin *= 0.6
                 continue
             if len(self.steps) > self.most_steps:
                 blocked = [f"{self.most_steps} edits were made, as many as are allowed"]
                 break
-            chosen = choose(self.steps, self.tables, self.requirement, self.rules, self.effects, self.fixed, margin)
+            chosen = choose(self.steps, self.tables, self.requirement, self.rules, self.effects, self.fixed,
+                            trainer=self.trainer)  # fmt: skip
             if isinstance(chosen, list):
-                blocked = chosen or ["nothing is missing on the tuning starts, yet the fresh ones say otherwise"]
+                blocked = chosen
                 break
             self._take(*chosen)
-        judged = {verdict.step for verdict in self.verdicts}
-        if best.number not in judged and not self._verdict(best).misses:
+        best = min(self.steps, key=lambda step: (self.requirement.distance(step.measured), step.number))
+        if all(verdict.step != best.number for verdict in self.verdicts) and not self.verdict(best).misses:
             blocked = []
         return self._end(best.number, blocked)
 
-    def _begin(self) -> None:
+    def _is_ready(self, step: Step) -> bool:
+        """Whether a step meets the requirement on all tuning starts, and was not judged too often."""
+        judged = sum(verdict.step == step.number for verdict in self.verdicts)
+        return judged < MOST_VERDICTS and not self.requirement.misses(step.measured, MARGIN)
+
+    def _starts(self) -> list[tuple[int, int]]:
+        """Seed and number of every set of tuning starts: those of a verdict that disappointed have become some."""
+        return [
+            (TUNING_SEED, TUNING_TRIALS),
+            *((verdict.seed, FRESH_TRIALS) for verdict in self.verdicts if verdict.misses),
+        ]
+
+    def _measure(self, policy: Policy, task: Task) -> Measured:
+        judgements = [fly_for(self.requirement, policy, task, *starts) for starts in self._starts()]
+        return self.requirement.measure(*judgements, fixed=self.bounds)
+
+    def _look_again(self) -> None:
+        """Every step measured on all the tuning starts there are."""
+        starts = self._starts()
+        for index, step in enumerate(self.steps):
+            if step.looks == len(starts):
+                continue
+            policy = load_policy(self._folder(step.number) / "policy.safetensors")
+            measured = self._measure(policy, self.task_of(step.values, step.reasons))
+            self.steps[index] = dataclasses.replace(step, measured=measured, looks=len(starts))
+            if step.number == self.verdicts[-1].step:
+                trials = sum(number for _, number in starts)
+                self.tell(f"again    step {step.number} on all {trials} starts seen so far, tuning starts from now on: "
+                          f"{describe_step(self.steps[index], None, self.requirement)}")  # fmt: skip
+        self._write()
+
+    def begin(self) -> None:
         """The first step: the policy of the nearest known task as it flies, or a training of it."""
-        if self.policy is None:
-            self.tell(f"start    {self.start}: nothing that flies this task is known; it is trained from nothing")
-            self._train(0, {}, {}, None, None)
+        start = self.start
+        if start.files is None or start.judgement is None:
+            self.tell(f"start    {start.name}: nothing that flies this task is known; it is trained from nothing")
+            self.train(0, {}, {}, None, None)
             return
-        self.tell(f"start    {self.start}, the known task that settles nearest")
+        times = ", ".join(f"{name} {said_of('settling_time', time, self.requirement)}"
+                          for name, time in start.times.items())  # fmt: skip
+        nearest = f": {start.name} is nearest" if len(start.times) > 1 else ""
+        self.tell(f"start    known tasks as they fly: {times}{nearest}")
         folder = self._folder(0)
         folder.mkdir(parents=True, exist_ok=True)
-        shutil.copyfile(shipped_files(self.start)[0], folder / "policy.safetensors")
-        shutil.copyfile(shipped_files(self.start)[1], folder / "run.json")
-        write_text(folder / "task.toml", write_task(self.base))
-        judgement = self._fly(self.policy, self.base, TUNING_SEED, TUNING_TRIALS)
-        measured = self.requirement.measure(judgement, self.bounds)
-        self._keep(Step(number=0, values={}, reasons={}, edit=None, origin=None, measured=measured, seconds=0.0))
+        shutil.copyfile(start.files[0], folder / "policy.safetensors")
+        shutil.copyfile(start.files[1], folder / "run.json")
+        write_text(folder / "task.toml", write_task(start.task))
+        measured = self.requirement.measure(start.judgement, fixed=self.bounds)
+        self._keep(
+            Step(number=0, values={}, reasons={}, edit=None, origin=None, measured=measured, looks=1, seconds=0.0)
+        )
 
     def _take(self, origin: Step, edit: Edit) -> None:
         number = len(self.steps)
-        self.tell(f"edit {number:<3} {describe_edit(edit)}")
+        back = "" if origin is self.steps[-1] else f"back at step {origin.number}, "
+        self.tell(f"edit {number:<3} {back}{describe_edit(edit, self.requirement)}")
         so_far = origin.reasons.get(edit.field, f"tuned: {edit.before:g}").split(",")[0]
         why = f"{so_far} -> {edit.after:g}, {edit.condition}: {edit.says} ({edit.rule}, {edit.source})"
-        self._train(
-            number, {**origin.values, edit.field: edit.after}, {**origin.reasons, edit.field: why}, edit, origin.number
-        )
+        values, reasons = {**origin.values, edit.field: edit.after}, {**origin.reasons, edit.field: why}
+        self.train(number, values, reasons, edit, origin.number)
 
-    def _train(
+    def train(
         self, number: int, values: dict[str, float], reasons: dict[str, str], edit: Edit | None, origin: int | None
     ) -> None:
-        folder = self._folder(number)
+        """One more step: the start's task with these values, trained on from step `origin`, and flown."""
         task = self.task_of(values, reasons)
-        resumable = (folder / "checkpoint" / "learner.safetensors").exists() and not (folder / "evaluated").exists()
-        if folder.exists() and not resumable:
-            shutil.rmtree(folder)
         initial = None
         if self.trainer == "apg" and origin is not None:
             initial = load_policy(self._folder(origin) / "policy.safetensors")
+        policy, seconds = self.learn(task, initial, self._folder(number), number)
+        self._keep(
+            Step(
+                number=number, values=values, reasons=reasons, edit=edit, origin=origin,
+                measured=self._measure(policy, task), looks=len(self._starts()), seconds=seconds,
+            )
+        )  # fmt: skip
+
+    def learn(self, task: Task, initial: Policy | None, folder: Path, number: int) -> tuple[Policy, float]:
+        """The policy of step `number`, trained into `folder` or gone on with there, and the seconds it took."""
+        resumable = (folder / "checkpoint" / "learner.safetensors").exists()
+        if folder.exists() and not resumable:
+            shutil.rmtree(folder)
         try:
             run = train(
                 task, self.trainer, seed=self.seed, out=folder, resume=resumable, initial=initial,
@@ -196,25 +195,13 @@ class Tuner:
                 f"interrupted in step {number}; everything so far is kept in {self.out}. "
                 "Go on with the same command and --resume."
             ) from error
-        judgement = self._fly(run.policy, task, TUNING_SEED, TUNING_TRIALS)
-        self._keep(
-            Step(
-                number=number,
-                values=values,
-                reasons=reasons,
-                edit=edit,
-                origin=origin,
-                measured=self.requirement.measure(judgement, self.bounds),
-                seconds=run.metrics[-1]["seconds"],
-            )
-        )
+        return run.policy, run.metrics[-1]["seconds"]
 
     def task_of(self, values: Mapping[str, float], reasons: Mapping[str, str]) -> Task:
         """The start's task with these edits."""
-        whole = {"apg.updates", "apg.environments", "apg.window", "horizon"}
-        return _edited(
-            self.base, {path: (round(v) if path in whole else v, reasons[path]) for path, v in values.items()}
-        )
+        whole = {"apg.updates", "ppo.steps"}
+        changes = {path: (round(value) if path in whole else value, reasons[path]) for path, value in values.items()}
+        return edited(self.start.task, changes)
 
     def _keep(self, step: Step) -> None:
         self.steps.append(step)
@@ -225,20 +212,21 @@ class Tuner:
         before = self.steps[step.origin].measured if step.origin is not None else None
         self.tell(f"step {step.number:<3} {describe_step(step, before, self.requirement)}")
 
-    def _verdict(self, step: Step) -> Verdict:
+    def verdict(self, step: Step) -> Verdict:
         """The step on starts of its own."""
         seed = FRESH_SEED + len(self.verdicts)
         policy = load_policy(self._folder(step.number) / "policy.safetensors")
-        judgement = self._fly(policy, self.task_of(step.values, step.reasons), seed, FRESH_TRIALS)
-        measured = self.requirement.measure(judgement, self.bounds)
+        task = self.task_of(step.values, step.reasons)
+        judgement = fly_for(self.requirement, policy, task, seed, FRESH_TRIALS)
+        measured = self.requirement.measure(judgement, fixed=self.bounds)
         verdict = Verdict(
             step=step.number, seed=seed, judgement=judgement.to_dict(), misses=self.requirement.misses(measured)
         )
         self.verdicts.append(verdict)
         self._write()
-        said = "met" if not verdict.misses else f"missed: {', '.join(verdict.misses)}"
-        self.tell(f"fresh    step {step.number} on {FRESH_TRIALS} starts never flown before: {said}; "
-                  f"{describe(measured, self.requirement)}")  # fmt: skip
+        missing = ", ".join(describe_miss(name, size, self.requirement) for name, size in verdict.misses.items())
+        self.tell(f"fresh    step {step.number} on {FRESH_TRIALS} starts never flown before: "
+                  f"{describe(measured, self.requirement)}; {f'missing: {missing}' if missing else 'met'}")  # fmt: skip
         return verdict
 
     def _end(self, best: int, blocked: list[str]) -> Tuning:
@@ -252,14 +240,11 @@ class Tuner:
         if told is not None:
             write_text(self.out / "evaluation.json", json.dumps(told, indent=2) + "\n")
         result = Tuning(
-            requirement=self.requirement, start=self.start, steps=self.steps, verdicts=self.verdicts, best=best,
+            requirement=self.requirement, start=self.start.name, steps=self.steps, verdicts=self.verdicts, best=best,
             blocked=blocked, directory=self.out,
         )  # fmt: skip
         self._write({"best": best, "met": result.met, "blocked": blocked})
         return result
-
-    def _fly(self, policy: Policy, task: Task, seed: int, trials: int) -> Judgement:
-        return judge(fly(policy, task, trials=trials, seed=seed, duration=float(self.duration)))
 
     def _folder(self, number: int) -> Path:
         return self.out / "steps" / f"{number:02d}"
@@ -268,7 +253,7 @@ class Tuner:
 
     def _write(self, ended: dict[str, Any] | None = None) -> None:
         told = {
-            "schema": 1, **self.asked, "start": self.start, "duration": self.duration,
+            "schema": 1, **self.asked, "start": self.start.name, "duration": self.duration,
             "steps": [step.to_dict() for step in self.steps],
             "verdicts": [dataclasses.asdict(verdict) for verdict in self.verdicts], **(ended or {}),
         }  # fmt: skip
@@ -364,23 +349,3 @@ def tune(
     tell(f"{'done' if result.met else 'not met'}     step {result.best} after {trained} trainings, "
          f"{time.monotonic() - begun:.0f} s")  # fmt: skip
     return result
-
-
-def _shipped(name: str) -> Policy | None:
-    return load_policy(shipped_files(name)[0]) if name in shipped_names() else None
-
-
-def _nobody() -> Any:
-    """A pilot that does nothing: its flights are for their starts alone."""
-    from flytune.control.classical import classical_pilot
-
-    return classical_pilot("lqr", load_task("baseline"), "tuned")
-
-
-def _edited(task: Task, changes: Mapping[str, tuple[Any, str]]) -> Task:
-    """The task with fields changed, each with the reason as its source."""
-    tables = document.plain(task)
-    for path, (value, why) in changes.items():
-        tables = document.edit(tables, path, value)
-        tables["sources"] = {**tables.get("sources", {}), path: why}
-    return document.read(Task, tables)

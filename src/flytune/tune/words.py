@@ -1,66 +1,94 @@
 """What a tuning says: a response, an edit and its reason, what an edit did, what is missing."""
 
 import math
-from typing import Any
 
-from flytune.tune.choose import HALF_WAY, Edit, Step
-from flytune.tune.requirement import MARGIN, Requirement
+from flytune.tune.requirement import MARGIN, Measured, Requirement
+from flytune.tune.step import HALF_WAY, Edit, Step
 
-
-def describe(measured: Any, requirement: Requirement) -> str:
-    """A measured response in words."""
-    time_said = f"{measured.settling_time:.2f} s" if math.isfinite(measured.settling_time) else "never"
-    error = f"{math.degrees(measured.error):.2f} deg" if requirement.axis == "yaw" else f"{1e3 * measured.error:.1f} mm"
-    kept = f", own bounds kept in {measured.kept:.0%}" if measured.kept < 1 else ""
-    return (
-        f"settles in {time_said}, overshoot {100 * measured.overshoot:.1f} %, error {error}, "
-        f"{measured.settled:.1%} settled{kept}"
-    )
+NAMES = {"settling_time": "settling time"}
 
 
-def describe_edit(edit: Edit) -> str:
-    """An edit and its reason in one line."""
-    known = {"flown": "from the steps so far", "map": "from the effect map", "rule": "by the rule"}[edit.known_from]
-    promise = ""
-    if edit.expects is not None:
-        promise = f"; expects {_value_said(edit.measure, edit.expects)}, {known}"
+def describe(measured: Measured, requirement: Requirement, notes: dict[str, str] | None = None) -> str:
+    """A measured response in words; `notes` says more of a measure."""
+    shown = ["settling_time", "overshoot", "error", "settled", *(["kept"] if measured.kept < 1 else [])]
+    said = {name: said_of(name, getattr(measured, name), requirement) for name in shown}
+    words = {
+        "settling_time": f"settles in {said['settling_time']}"
+        if math.isfinite(measured.settling_time)
+        else "no median",
+        "overshoot": f"overshoot {said['overshoot']}",
+        "error": f"error {said['error']}",
+        "settled": f"{said['settled']} settled",
+        "kept": f"own bounds kept in {said.get('kept')}",
+    }
+    return ", ".join(words[name] + (notes or {}).get(name, "") for name in shown)
+
+
+def describe_edit(edit: Edit, requirement: Requirement) -> str:
+    """An edit in one line: what is missing, the edit, what is expected and why so, the rule, and the next best edit."""
     condition = "too far" if edit.rule == HALF_WAY else edit.condition
-    return (
-        f"{condition}: {edit.field} {edit.before:g} -> {edit.after:g} ({edit.rule}: {edit.says}; "
-        f"{edit.source}{promise})"
-    )
+    known = f" ({_known(edit)})" if _known(edit) else ""
+    second = ""
+    if edit.second is not None:
+        second = f". Next best: {edit.second.rule}, {_change(edit.second, requirement)}"
+    return f"{condition}: {_change(edit, requirement)}{known}. {edit.rule}: {edit.says} ({edit.source}){second}"
 
 
-def describe_step(step: Step, before: Any, requirement: Requirement) -> str:
-    """What a step's response is, what is missing of it, and what its edit did."""
-    parts = [describe(step.measured, requirement)]
+def describe_step(step: Step, before: Measured | None, requirement: Requirement) -> str:
+    """What a step's response is beside what it was and what was expected of its edit, and what is missing."""
+    notes = {}
     if step.edit is not None and before is not None:
         measure = step.edit.measure
-        was, now = getattr(before, measure), getattr(step.measured, measure)
-        parts.append(f"{_named(measure)} {_value_said(measure, was)} -> {_value_said(measure, now)}")
+        note = f"was {said_of(measure, getattr(before, measure), requirement)}"
+        if step.edit.expects is not None:
+            note += f", expected {said_of(measure, step.edit.expects, requirement)}"
+        notes[measure] = f" ({note})"
     misses = requirement.misses(step.measured, MARGIN)
-    parts.append(
-        f"missing: {', '.join(describe_miss(n, s, requirement) for n, s in misses.items())}" if misses else "met"
-    )
-    return "; ".join(parts)
+    missing = ", ".join(describe_miss(name, size, requirement, MARGIN) for name, size in misses.items())
+    return f"{describe(step.measured, requirement, notes)}; {f'missing: {missing}' if missing else 'met'}"
 
 
-def describe_miss(measure: str, size: float, requirement: Requirement) -> str:
-    """A miss, as `Requirement.misses` has it, in words."""
+def describe_miss(measure: str, size: float, requirement: Requirement, margin: float = 1.0) -> str:
+    """A miss, as `Requirement.misses` has it with this margin, in words."""
     if measure == "settling_time":
         side = "slow" if size > 0 else "fast"
-        share = f"{abs(math.expm1(size)):.0%}" if math.isfinite(size) else "far"
+        share = f"{100 * abs(math.expm1(size)):.0f} %" if math.isfinite(size) else "far"
         return f"{share} too {side} for {requirement.aim():g} s"
-    return {"settled": "trials do not settle", "kept": "bounds are broken"}.get(measure, f"{_named(measure)} too large")
+    if measure in ("settled", "kept"):
+        share = said_of(measure, requirement.settled + size, requirement)
+        return f"only {share} settle" if measure == "settled" else f"only {share} keep the bounds you have set"
+    return f"{measure} above {said_of(measure, margin * getattr(requirement, measure), requirement)}"
 
 
-def _named(measure: str) -> str:
-    return {"settling_time": "settling time", "kept": "bounds kept"}.get(measure, measure)
-
-
-def _value_said(measure: str, value: float) -> str:
+def said_of(measure: str, value: float, requirement: Requirement) -> str:
+    """A number of a measure with its unit."""
     if not math.isfinite(value):
         return "never"
     if measure == "settling_time":
         return f"{value:.2f} s"
-    return f"{1e3 * value:.1f} mm" if measure == "error" else f"{value:.1%}"
+    if measure == "error":
+        return f"{math.degrees(value):.2f} deg" if requirement.axis == "yaw" else f"{1e3 * value:.1f} mm"
+    return f"{100 * value:.1f} %"
+
+
+def _change(edit: Edit, requirement: Requirement) -> str:
+    """What is edited, and what the measure is expected to be afterwards."""
+    unit = f" {edit.unit}" if edit.unit and "unit(" not in edit.unit else ""
+    expects = ""
+    if edit.expects is not None:
+        expects = (
+            f", expects {NAMES.get(edit.measure, edit.measure)} {said_of(edit.measure, edit.expects, requirement)}"
+        )
+    return f"{edit.field} {edit.before:g} -> {edit.after:g}{unit}{expects}"
+
+
+def _known(edit: Edit) -> str:
+    """Where the size of an edit comes from, with the slope it counts on."""
+    if edit.rule == HALF_WAY:
+        return "half of the last edit"
+    if edit.known_from == "between":
+        return "between the steps on both sides"
+    if edit.expects is None:
+        return "the rule's largest step"
+    known = {"flown": "steps so far", "map": "effect map", "rule": "the rule's own guess"}[edit.known_from]
+    return f"{known}: {NAMES.get(edit.measure, edit.measure)} goes as the field to the power {edit.slope:.2g}"
