@@ -48,7 +48,7 @@ def test_a_known_response_is_found_at_once_and_flies_everywhere_a_run_does(tmp_p
     assert judged["position"]["settled"] == 100
     kept = {path.name for path in (tmp_path / "mine").iterdir()}
     assert {"task.toml", "run.json", "policy.safetensors", "evaluation.json", "tune.json", "report.html"} <= kept
-    assert "tuned: the episodes are longer" in (tmp_path / "mine" / "task.toml").read_text()
+    assert "tuned: trials of more than twice the settling time" in (tmp_path / "mine" / "task.toml").read_text()
     assert "already holds" in flytune("tune", "--settling-time", "3", "--out", "mine", cwd=tmp_path, expect=2).stderr
 
 

@@ -38,6 +38,31 @@ def test_a_slope_is_that_of_the_two_values_around():
     assert known.elasticity("knob", "settling_time", 3.0) == pytest.approx(-1)
 
 
+def test_downwards_from_a_measured_value_the_interval_below_counts():
+    known = effects(VALUES, [4.0, 4.0, 2.0, 2.0, 2.0])
+    assert known.elasticity("knob", "settling_time", 2.0, up=False) == 0
+    assert known.elasticity("knob", "settling_time", 4.0, up=False) == pytest.approx(-1)
+    assert known.elasticity("knob", "settling_time", 0.5, up=False) == 0
+    assert not known.matters("knob", "settling_time", 2.0, up=False)
+
+
+def test_an_axis_has_its_own_curve():
+    known = load_effects()
+    rate = "termination.body_rate.bound_deg_per_s"
+    assert known.elasticity(rate, "settling_time", 300, "yaw") < -1
+    assert abs(known.elasticity(rate, "settling_time", 300, "z")) < 0.3
+    assert known.matters("reward.vertical.sharpness", "settling_time", 4.0, "z")
+    assert not known.matters("reward.vertical.sharpness", "settling_time", 4.0)
+    assert known.elasticity("reward.attitude.weight", "error", 0.1, "yaw") < -0.5
+
+
+def test_a_constant_reward_moves_nothing_and_the_speed_bound_does():
+    known = load_effects()
+    assert not known.moves("reward.survival.reward")
+    assert known.moves("termination.speed.bound")
+    assert known.moves("never measured")
+
+
 def test_a_knob_at_0_has_no_logarithm_and_is_left_out():
     known = effects((0.0, 1.0, 2.0), [9.0, 2.0, 1.0])
     assert known.elasticity("knob", "settling_time", 0.5) == pytest.approx(-1)
@@ -54,7 +79,7 @@ def test_no_overshoot_at_all_counts_as_a_little():
     assert effects(VALUES, [1.0] * 5).elasticity("knob", "overshoot", 1.0) == 0
 
 
-def test_a_change_matters_where_it_is_larger_than_that_between_seeds():
+def test_a_change_matters_where_the_seeds_of_both_values_are_apart():
     assert effects(VALUES, [4.0, 3.0, 2.0, 1.5, 1.2], spread=0.1).matters("knob", "settling_time", 1.5)
     assert not effects(VALUES, [4.0, 3.9, 3.8, 3.7, 3.6], spread=0.1).matters("knob", "settling_time", 1.5)
 
@@ -67,6 +92,7 @@ def test_a_change_matters_where_it_is_larger_than_that_between_seeds():
         ((2.0, 2.05, 2.0, 2.0, 1.9), 0.0, "no effect"),
         ((4.0, 3.5, 3.0, 2.5, 2.0), 1.5, "no effect"),
         ((4.0, 4.0, 4.0, 4.0, 2.0), 0.0, "only beyond a threshold"),
+        ((4.0, 3.5, 3.0, 2.5, 2.0), 0.9, "confirmed"),
         ((None, None, None, None, 2.0), 0.0, "no effect"),
         ((None, 4.0, 3.0, 2.5, 2.0), 0.0, "confirmed"),
     ],

@@ -113,7 +113,18 @@ def test_only_bounds_the_user_has_set_have_to_be_kept(pid_flights):
     judged = dataclasses.replace(judged, violated={**judged.violated, "speed": broken})
     wanted = make_requirement(3)
     assert wanted.measure(judged).kept == 1
-    assert wanted.measure(judged, ("speed",)).kept == pytest.approx(0.75)
+    assert wanted.measure(judged, fixed=("speed",)).kept == pytest.approx(0.75)
+
+
+def test_trials_of_two_judgements_count_as_one_set(pid_flights):
+    first = judge(pid_flights)
+    late = {**first.settling_time, "position": first.settling_time["position"] + 100.0}
+    second = dataclasses.replace(first, settling_time=late)
+    both = make_requirement(3, percentile=60).measure(first, second)
+    # 60 % of 80 trials are the 40 early ones and the first 8 of the late ones: the 8th of 40 is percentile 20 of them
+    assert both.settling_time == make_requirement(3, percentile=20).measure(second).settling_time
+    lost = dataclasses.replace(first, settling_time={**late, "position": np.full(40, np.inf)})
+    assert make_requirement(3).measure(first, lost).settled == pytest.approx(0.5)
 
 
 @pytest.fixture(scope="module")

@@ -27,7 +27,7 @@ def test_what_a_known_policy_already_does_takes_no_training(tmp_path):
     assert result.met
     assert result.best == 0
     assert result.start == "baseline-refined"
-    assert [line.split()[0] for line in said] == ["asked", "start", "step", "fresh", "done"]
+    assert [line.split()[0] for line in said] == ["asked", "on", "start", "step", "fresh", "done"]
     pilot = find_pilot(str(tmp_path / "t"))
     assert judge(fly(pilot.controller, pilot.task, seed=7)).settled("position") == 100
 
@@ -48,12 +48,41 @@ def test_a_directory_that_holds_a_run_is_refused_and_kept(tmp_path):
 def test_to_resume_needs_a_tuning_that_was_asked_for_the_same(tmp_path):
     with pytest.raises(BadInput, match="holds no tuning"):
         tune(make_requirement(3.0), RULES, tmp_path / "none", resume=True)
-    tune(make_requirement(3.4), RULES, tmp_path / "t", most_steps=1)
+    fixed = {"apg.updates": 1}
+    tune(make_requirement(3.4), RULES, tmp_path / "t", edits=fixed, most_steps=1)
     with pytest.raises(BadInput, match="another requirement"):
-        tune(make_requirement(3.0), RULES, tmp_path / "t", resume=True)
+        tune(make_requirement(3.0), RULES, tmp_path / "t", edits=fixed, resume=True)
     (tmp_path / "t" / "tune.json").write_text("{")
     with pytest.raises(BadInput, match="damaged"):
-        tune(make_requirement(3.4), RULES, tmp_path / "t", resume=True)
+        tune(make_requirement(3.4), RULES, tmp_path / "t", edits=fixed, resume=True)
+
+
+def test_starts_of_a_verdict_that_disappoints_become_tuning_starts_and_a_resumed_tuning_knows_them(tmp_path):
+    # the median yaw of the tuning starts is not that of others, and 2 % of tolerance tell them apart
+    policy, task = _known("baseline-refined")
+    tuning, others = (judge(fly(policy, task, trials=n, seed=s)) for n, s in ((100, 3000), (200, 4000)))
+    time, elsewhere, everywhere = (
+        make_requirement(1, axis="yaw").measure(*judged).settling_time
+        for judged in ((tuning,), (others,), (tuning, others))
+    )
+    assert abs(elsewhere / time - 1) > 0.02
+    said = []
+    wanted = make_requirement(time, axis="yaw", tolerance=2)
+    fixed = {"apg.updates": 1}
+    result = tune(wanted, RULES, tmp_path / "t", task="baseline-refined", edits=fixed, most_steps=1, tell=said.append)
+    first = result.verdicts[0]
+    assert (first.step, set(first.misses)) == (0, {"settling_time"})
+    assert "step 0 on all 300 starts seen so far" in next(line for line in said if line.startswith("again"))
+    assert result.steps[0].measured.settling_time == everywhere
+    told = json.loads((tmp_path / "t" / "tune.json").read_text())
+    # cut off between the verdict and the second look
+    told["steps"] = [told["steps"][0] | {"looks": 1, "measured": wanted.measure(tuning).to_dict()}]
+    told["verdicts"] = told["verdicts"][:1]
+    shutil.rmtree(tmp_path / "t" / "steps" / "01", ignore_errors=True)
+    (tmp_path / "t" / "tune.json").write_text(json.dumps(told))
+    again = tune(wanted, RULES, tmp_path / "t", task="baseline-refined", edits=fixed, most_steps=1, resume=True)
+    assert [step.measured for step in again.steps] == [step.measured for step in result.steps]
+    assert [verdict.seed for verdict in again.verdicts] == [verdict.seed for verdict in result.verdicts]
 
 
 @pytest.mark.slow

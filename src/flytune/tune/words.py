@@ -12,10 +12,9 @@ def describe(measured: Measured, requirement: Requirement, notes: dict[str, str]
     """A measured response in words; `notes` says more of a measure."""
     shown = ["settling_time", "overshoot", "error", "settled", *(["kept"] if measured.kept < 1 else [])]
     said = {name: said_of(name, getattr(measured, name), requirement) for name in shown}
+    settles = math.isfinite(measured.settling_time)
     words = {
-        "settling_time": f"settles in {said['settling_time']}"
-        if math.isfinite(measured.settling_time)
-        else "no median",
+        "settling_time": f"settles in {said['settling_time']}" if settles else "does not settle",
         "overshoot": f"overshoot {said['overshoot']}",
         "error": f"error {said['error']}",
         "settled": f"{said['settled']} settled",
