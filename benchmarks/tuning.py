@@ -86,7 +86,7 @@ def solve(folder: Path, index: int, method: str, seed: int) -> None:
 
         spent = 0.0  # s in trainings made now
 
-        def learn(self, task: Task, initial: Policy | None, folder: Path, number: int) -> tuple[Policy, float]:
+        def learn(self, task: Task, initial: Policy | None, folder: Path) -> tuple[Policy, float]:
             tables = {name: value for name, value in plain(task).items() if name not in ("name", "duration", "sources")}
             start = b"".join(np.asarray(leaf).tobytes() for leaf in jax.tree.leaves(initial))
             told = json.dumps([tables, self.trainer, self.seed], sort_keys=True).encode()
@@ -95,7 +95,7 @@ def solve(folder: Path, index: int, method: str, seed: int) -> None:
                 shutil.copytree(known, folder, dirs_exist_ok=True)
                 run = json.loads((folder / "run.json").read_text(encoding="utf-8"))
                 return load_policy(folder / "policy.safetensors"), run["seconds"]
-            policy, seconds = super().learn(task, initial, folder, number)
+            policy, seconds = super().learn(task, initial, folder)
             self.spent += seconds
             part = known.with_name(f"{known.name}-{os.getpid()}")
             part.mkdir(parents=True)

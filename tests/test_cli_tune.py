@@ -73,3 +73,17 @@ def test_an_interrupted_tuning_keeps_its_steps_and_goes_on(tmp_path):
     after = json.loads((tmp_path / "mine" / "tune.json").read_text())
     assert after["met"]
     assert after["steps"][0] == before["steps"][0]
+    # one that has ended is told again, and judged no further
+    flytune(*arguments, "--resume", cwd=tmp_path)
+    assert json.loads((tmp_path / "mine" / "tune.json").read_text()) == after
+
+
+def test_an_interrupted_first_training_goes_on_where_it_was(tmp_path):
+    arguments = ["tune", "baseline", "--settling-time", "5", "--out", "mine", "--steps", "1", "--set", "apg.updates=30"]
+    message = interrupted(*arguments, cwd=tmp_path, at="50 %")
+    assert "interrupted in step 0" in message
+    assert "--out mine and --resume" in message
+    assert json.loads((tmp_path / "mine" / "tune.json").read_text())["steps"] == []
+    flytune(*arguments, "--resume", cwd=tmp_path, expect=4)
+    rows = (tmp_path / "mine" / "steps" / "00" / "metrics.jsonl").read_text().splitlines()
+    assert [json.loads(row)["update"] for row in rows] == list(range(1, 31))

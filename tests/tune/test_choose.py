@@ -203,7 +203,7 @@ def test_an_edit_that_would_break_another_requirement_is_worth_less():
     _, edit = chosen(steps, make_requirement(6), effects=KNOWN, rules=only)
     assert edit.after < 400
     refused = choose(steps, TABLES, make_requirement(6, overshoot=0), only, KNOWN, ())
-    assert refused == ["too fast: H9 slower turns (would break the overshoot)"]
+    assert refused == ["too fast: H9 slower turns (would harm the overshoot more)"]
 
 
 def test_a_step_flown_nearby_says_what_an_edit_would_break():

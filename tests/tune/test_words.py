@@ -14,11 +14,12 @@ BEFORE = Measured(settling_time=10.6, overshoot=0.0, error=0.0008, settled=0.88,
 AFTER = Measured(settling_time=7.42, overshoot=0.012, error=0.0013, settled=1.0, kept=1.0)
 SECOND = Edit(
     rule="H6 faster", source="paper H6", says="", condition="too slow", field="reward.velocity.weight", before=0.1,
-    after=0.05, unit="", expects=10.31, slope=0.04, known_from="map",
+    after=0.05, unit="", expects=10.31, slope=0.04, known_from="map", gain=0.1,
 )  # fmt: skip
 EDIT = Edit(
     rule="H7 faster", source="paper H7", says="a higher speed bound shortens the cruise", condition="too slow",
-    field="termination.speed.bound", before=0.2, after=0.304, unit="m/s", expects=5.99, slope=-1.36, known_from="map",
+    field="termination.speed.bound", before=0.2, after=0.304, unit="m/s", expects=5.99, slope=-1.36,
+    known_from="map", gain=1.0,
     second=SECOND,
 )  # fmt: skip
 

@@ -86,42 +86,66 @@ def _left(case: _Case, step: Step) -> float:
 def _options(case: _Case, step: Step) -> tuple[list[tuple[float, Edit]], dict[str, list[str]]]:
     """The edits of a step that promise more than they cost, each with how far it is expected to be then; and by
     condition, why not the others."""
-    parts = case.requirement.parts(step.measured, case.margin)
-    misses = case.requirement.misses(step.measured, case.margin)
     found: list[tuple[float, Edit]] = []
     refused: dict[str, list[str]] = {}
-    for condition in conditions(misses):
+    for condition in conditions(case.requirement.misses(step.measured, case.margin)):
         for rule in case.rules:
             if rule.advice or rule.when != condition:
                 continue
-            edit, worth = _edit(case, rule, step, misses)
-            if isinstance(edit, str):
-                refused.setdefault(condition, []).append(f"{rule.name} ({edit})")
-            else:
-                found.append((sum(parts.values()) - parts[rule.measure] * worth, edit))
+            edit = _edit(case, rule, step)
+            left, why_not = (0.0, edit) if isinstance(edit, str) else _left_after(case, step, edit)
+            if why_not:
+                refused.setdefault(condition, []).append(f"{rule.name} ({why_not})")
+            elif isinstance(edit, Edit):
+                found.append((left, edit))
     return found, refused
 
 
-def _edit(case: _Case, rule: Rule, step: Step, misses: Mapping[str, float]) -> tuple[Edit | str, float]:
-    """The edit a rule asks for and its worth: the share that it promises of what is missing, as far as that can be
-    trusted, less what it costs. Or why the rule is not used."""
+def _left_after(case: _Case, step: Step, edit: Edit) -> tuple[float, str]:
+    """How far the edited step is expected to be, and why that is no gain, where it is none.
+
+    What is missing of the edit's own measure shrinks by the share that the edit promises, as far as that can be
+    trusted; of the other measures it becomes what it is in the step flown nearest to where the edit goes, or, where
+    there is none, what the effect map warns of.
+    """
+    parts = case.requirement.parts(step.measured, case.margin)
+    own, before = parts[edit.measure], sum(parts.values())
+    gain = edit.gain * TRUST[edit.known_from] - EFFORT * abs(math.log(edit.after / edit.before))
+    nearby = _nearby(case, edit, step)
+    if nearby is not None:
+        there = case.requirement.parts(nearby.measured, case.margin)
+        worse = {name: there[name] - parts.get(name, 0.0) for name in there if name != edit.measure}
+        harm = {name: more for name, more in worse.items() if more > 0}
+    else:
+        others = [name for name in MEASURES if name != edit.measure and name not in parts]
+        harm = {name: HARM * own for name in others if _mapped_miss(case, edit, step, name)}
+    left = before - own * gain + sum(harm.values())
+    if left < before:
+        return left, ""
+    harmed = " and the ".join(harm).replace("_", " ")
+    return left, f"would harm the {harmed} more" if harm else "promises too little"
+
+
+def _edit(case: _Case, rule: Rule, step: Step) -> Edit | str:
+    """The edit a rule asks for, or why the rule is not used."""
+    misses = case.requirement.misses(step.measured, case.margin)
     axis = case.requirement.axis
     if rule.field.split(".")[0] in {"apg", "ppo"} - {case.trainer}:
-        return f"{rule.field} is of another trainer", 0.0
+        return f"{rule.field} is of another trainer"
     if is_fixed(rule.field, case.fixed):
-        return f"{rule.field} is set by the user", 0.0
+        return f"{rule.field} is set by the user"
     value = step.values.get(rule.field) or field_of(dict(case.tables), rule.field)
     if not value or value <= 0:
-        return f"the task has no {rule.field}, or it is 0", 0.0
+        return f"the task has no {rule.field}, or it is 0"
     if missed := [measure for measure in rule.spares if measure in misses and measure != rule.measure]:
-        return f"not while the {' and the '.join(missed).replace('_', ' ')} is missed", 0.0
+        return f"not while the {' and the '.join(missed).replace('_', ' ')} is missed"
     if _disappointed(rule, case.steps):
-        return "it was tried, and did not help", 0.0
+        return "it was tried, and did not help"
     if case.mapped and not case.effects.moves(rule.field, axis):
-        return "measured to move nothing", 0.0
+        return "measured to move nothing"
     slope, known_from = _slope(case, rule, value, step)
     if slope is None:
-        return known_from, 0.0
+        return known_from
     aim = math.nan if rule.measure in ("settled", "kept") else _aim(rule.measure, case.requirement, case.margin)
     now = getattr(step.measured, rule.measure)
     up = 1 if rule.direction == "up" else -1
@@ -139,10 +163,10 @@ def _edit(case: _Case, rule: Rule, step: Step, misses: Mapping[str, float]) -> t
         gain = min(1.0, promised / wanted) if wanted else 0.0
         expects = now * math.exp(promised)
     if (after - value) * up <= 0 or abs(after / value - 1) < 0.002:
-        return f"{rule.field} is at {value:g}, the end of its range", 0.0
+        return f"{rule.field} is at {value:g}, the end of its range"
     if (twin := _twin(case, step, rule.field, after)) is not None:
-        return f"{rule.field} {after:g} was flown in step {twin.number}", 0.0
-    edit = Edit(
+        return f"{rule.field} {after:g} was flown in step {twin.number}"
+    return Edit(
         rule=rule.name,
         source=rule.source,
         says=rule.says,
@@ -154,12 +178,8 @@ def _edit(case: _Case, rule: Rule, step: Step, misses: Mapping[str, float]) -> t
         expects=expects,
         slope=slope,
         known_from=known_from,
+        gain=gain,
     )
-    harmed = _harmed(case, edit, step, misses)
-    worth = gain * TRUST[known_from] - EFFORT * abs(math.log(after / value)) - HARM * len(harmed)
-    if worth <= 0:
-        return f"would break the {' and the '.join(harmed)}" if harmed else "promises too little", 0.0
-    return edit, worth
 
 
 def _aim(measure: str, requirement: Requirement, margin: float) -> float:
@@ -248,17 +268,6 @@ def _disappointed(rule: Rule, steps: Sequence[Step]) -> bool:
     if expects is None or not math.isfinite(before):
         return not math.isfinite(now)
     return (now - before) / (expects - before) < 0.1 if expects != before else False
-
-
-def _harmed(case: _Case, edit: Edit, step: Step, misses: Mapping[str, float]) -> list[str]:
-    """The other measures that the edit is known to push over their bounds: by the step flown nearest to where it goes,
-    or else by the effect map."""
-    nearby = _nearby(case, edit, step)
-    if nearby is not None:
-        found = [name for name in case.requirement.misses(nearby.measured) if name != edit.measure]
-    else:
-        found = [name for name in MEASURES if name != edit.measure and _mapped_miss(case, edit, step, name)]
-    return [name.replace("_", " ") for name in found if name not in misses]
 
 
 def _nearby(case: _Case, edit: Edit, step: Step) -> Step | None:

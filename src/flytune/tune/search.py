@@ -77,17 +77,17 @@ class Tuner:
         self.tell(f"asked    {self.requirement}")
         self.tell(f"         on the tuning starts {100 * MARGIN:.0f} % of the tolerance and of the bounds is allowed, "
                   "so that fresh starts do not disappoint")  # fmt: skip
+        for step in self.steps:
+            self._say(step)
         if not self.steps:
+            self._write()
             self.begin()
-        else:
-            for step in self.steps:
-                self._say(step)
         while True:
+            if met := [verdict.step for verdict in self.verdicts if not verdict.misses]:
+                return self._end(met[0], [])
             self._look_again()
-            ready = [step for step in self.steps if self._is_ready(step)]
-            if ready:
-                if not self.verdict(ready[-1]).misses:
-                    return self._end(ready[-1].number, [])
+            if ready := [step for step in self.steps if self._is_ready(step)]:
+                self.verdict(ready[-1])
                 continue
             if len(self.steps) > self.most_steps:
                 blocked = [f"{self.most_steps} edits were made, as many as are allowed"]
@@ -99,8 +99,8 @@ class Tuner:
                 break
             self._take(*chosen)
         best = min(self.steps, key=lambda step: (self.requirement.distance(step.measured), step.number))
-        if all(verdict.step != best.number for verdict in self.verdicts) and not self.verdict(best).misses:
-            blocked = []
+        if all(verdict.step != best.number for verdict in self.verdicts):
+            self.verdict(best)
         return self._end(best.number, blocked)
 
     def _is_ready(self, step: Step) -> bool:
@@ -172,7 +172,7 @@ class Tuner:
         initial = None
         if self.trainer == "apg" and origin is not None:
             initial = load_policy(self._folder(origin) / "policy.safetensors")
-        policy, seconds = self.learn(task, initial, self._folder(number), number)
+        policy, seconds = self.learn(task, initial, self._folder(number))
         self._keep(
             Step(
                 number=number, values=values, reasons=reasons, edit=edit, origin=origin,
@@ -180,21 +180,15 @@ class Tuner:
             )
         )  # fmt: skip
 
-    def learn(self, task: Task, initial: Policy | None, folder: Path, number: int) -> tuple[Policy, float]:
-        """The policy of step `number`, trained into `folder` or gone on with there, and the seconds it took."""
+    def learn(self, task: Task, initial: Policy | None, folder: Path) -> tuple[Policy, float]:
+        """The policy of a task, trained into `folder` or gone on with there, and the seconds it took."""
         resumable = (folder / "checkpoint" / "learner.safetensors").exists()
         if folder.exists() and not resumable:
             shutil.rmtree(folder)
-        try:
-            run = train(
-                task, self.trainer, seed=self.seed, out=folder, resume=resumable, initial=initial,
-                on_progress=self.on_progress,
-            )  # fmt: skip
-        except Interrupted as error:
-            raise Interrupted(
-                f"interrupted in step {number}; everything so far is kept in {self.out}. "
-                "Go on with the same command and --resume."
-            ) from error
+        run = train(
+            task, self.trainer, seed=self.seed, out=folder, resume=resumable, initial=initial,
+            on_progress=self.on_progress,
+        )  # fmt: skip
         return run.policy, run.metrics[-1]["seconds"]
 
     def task_of(self, values: Mapping[str, float], reasons: Mapping[str, str]) -> Task:
@@ -344,7 +338,13 @@ def tune(
     )  # fmt: skip
     if resume:
         tuner.resume()
-    result = tuner.run()
+    try:
+        result = tuner.run()
+    except (Interrupted, KeyboardInterrupt):
+        raise Interrupted(
+            f"interrupted in step {len(tuner.steps)}; everything so far is kept in {out}. "
+            f"Go on with the same command, --out {out} and --resume."
+        ) from None
     trained = len([step for step in result.steps if step.seconds])
     tell(f"{'done' if result.met else 'not met'}     step {result.best} after {trained} trainings, "
          f"{time.monotonic() - begun:.0f} s")  # fmt: skip

@@ -25,6 +25,7 @@ class Edit:
     expects: float | None  # of the rule's measure; None where no number can be promised
     slope: float  # d log(measure) / d log(field) that is counted on
     known_from: str  # flown, between, map or rule
+    gain: float  # share of what is missing of the measure that the edit promises, 1 at most
     second: "Edit | None" = None  # of another field, the next best
 
     @property
