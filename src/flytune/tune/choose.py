@@ -15,6 +15,7 @@ from flytune.tune.step import HALF_WAY, Edit, Step
 TRUST = {"between": 1.0, "flown": 1.0, "map": 0.9, "rule": 0.6}  # in a slope, by where it comes from
 EFFORT = 0.1  # what a factor of e costs: of two edits that promise the same, the smaller
 SAME = 0.01  # two values of a field nearer than this share are the same
+FEEBLE = 0.25  # a slope less than this share of the effect map's, flown elsewhere, does not count
 HARM = 0.5  # what it costs to push another measure over its bound
 MEASURES = ("settling_time", "overshoot", "error")  # that the effect map knows
 
@@ -139,13 +140,13 @@ def _edit(case: _Case, rule: Rule, step: Step) -> Edit | str:
         return f"the task has no {rule.field}, or it is 0"
     if missed := [measure for measure in rule.spares if measure in misses and measure != rule.measure]:
         return f"not while the {' and the '.join(missed).replace('_', ' ')} is missed"
-    if _disappointed(rule, case.steps):
-        return "it was tried, and did not help"
     if case.mapped and not case.effects.moves(rule.field, axis):
         return "measured to move nothing"
     slope, known_from = _slope(case, rule, value, step)
     if slope is None:
         return known_from
+    if known_from != "flown" and _disappointed(case, rule, value):
+        return "it was tried, and did not help"
     aim = math.nan if rule.measure in ("settled", "kept") else _aim(rule.measure, case.requirement, case.margin)
     now = getattr(step.measured, rule.measure)
     up = 1 if rule.direction == "up" else -1
@@ -213,6 +214,9 @@ def _value(step: Step, field: str, steps: Sequence[Step]) -> float | None:
 
 def _slope(case: _Case, rule: Rule, value: float, step: Step) -> tuple[float | None, str]:
     """d log(measure) / d log(field) and where it is known from; None and the reason where the rule does not hold."""
+    what = (rule.field, rule.measure, value, case.requirement.axis, rule.direction == "up")
+    measured = case.effects.elasticity(*what) if rule.measure in MEASURES else None
+    holds = measured is not None and measured * rule.slope > 0 and case.effects.matters(*what)
     flown = []
     for other in case.steps:
         there = _value(other, rule.field, case.steps)
@@ -220,14 +224,15 @@ def _slope(case: _Case, rule: Rule, value: float, step: Step) -> tuple[float | N
             continue
         now, then = (getattr(each.measured, rule.measure) for each in (step, other))
         if now > 0 and then > 0 and math.isfinite(now) and math.isfinite(then):
-            flown.append((abs(math.log(there / value)), math.log(then / now) / math.log(there / value)))
+            flown.append((abs(math.log(there / value)), math.log(then / now) / math.log(there / value), there))
     if flown:
-        found = min(flown)[1]
-        if found * rule.slope > 0 and abs(found) > 0.1 * abs(float(rule.slope)):
+        _, found, there = min(flown)
+        # where the map knows of a threshold ahead, what was flown before it says nothing of what comes after
+        feeble = holds and measured is not None and abs(found) < FEEBLE * abs(measured)
+        told = not feeble or case.effects.ahead(rule.field, value, rule.direction == "up", there)
+        if told and found * rule.slope > 0 and abs(found) > 0.1 * abs(float(rule.slope)):
             return found, "flown"
-    what = (rule.field, rule.measure, value, case.requirement.axis, rule.direction == "up")
-    measured = case.effects.elasticity(*what) if rule.measure in MEASURES else None
-    if measured is not None and measured * rule.slope > 0 and case.effects.matters(*what):
+    if holds:
         return measured, "map"
     if measured is None or not case.mapped:
         return float(rule.slope), "rule"
@@ -236,26 +241,46 @@ def _slope(case: _Case, rule: Rule, value: float, step: Step) -> tuple[float | N
 
 
 def _between(rule: Rule, step: Step, steps: Sequence[Step], aim: float) -> float | None:
-    """The field's value between the nearest faster and slower steps, on a line in logarithms; None without both."""
+    """The field's value between the nearest faster and slower steps, on a line in logarithms; None without both.
+
+    Where one end stays while step after step falls on the other side, it counts half as much each time: a curve that
+    bends would else be followed in ever smaller steps (the Illinois variant of the false position method).
+
+    Source: Dowell and Jarratt 1971, A modified regula falsi method for computing the root of an equation.
+    """
     around = [
-        (math.log(there), math.log(each.measured.settling_time / aim))
+        (math.log(each.measured.settling_time / aim), math.log(there), each.number)
         for each in steps
         if _alike(step, each, rule.field)
         and (there := _value(each, rule.field, steps)) is not None
         and math.isfinite(each.measured.settling_time)
         and each.measured.settling_time > 0
     ]
-    slow = min((point for point in around if point[1] > 0), key=lambda point: point[1], default=None)
-    fast = max((point for point in around if point[1] <= 0), key=lambda point: point[1], default=None)
-    if slow is None or fast is None:
+    slower, faster = [p for p in around if p[0] > 0], [p for p in around if p[0] <= 0]
+    if not slower or not faster:
         return None
-    share = slow[1] / (slow[1] - fast[1])
-    return math.exp(slow[0] + max(0.1, min(0.9, share)) * (fast[0] - slow[0]))
+    (late, slow, _), (early, fast, _) = ends = min(slower), max(faster)
+    stays = [sum(each[2] > end[2] for each in others) - 1 for end, others in zip(ends, (faster, slower), strict=True)]
+    late, early = (off * 0.5 ** max(0, count) for off, count in zip((late, early), stays, strict=True))
+    share = late / (late - early)
+    return math.exp(slow + max(0.1, min(0.9, share)) * (fast - slow))
 
 
-def _disappointed(rule: Rule, steps: Sequence[Step]) -> bool:
-    """Whether the rule's last use moved its measure by less than a tenth of what it promised, or the wrong way."""
-    used = [step for step in steps if step.edit and step.edit.rule == rule.name and step.origin is not None]
+def _disappointed(case: _Case, rule: Rule, value: float) -> bool:
+    """Whether the rule's last use moved its measure by less than a tenth of what it promised, or the wrong way.
+
+    Of a field that the effect map knows, only uses between the same two of its values count: a knob may have an effect
+    only beyond a threshold.
+    """
+    steps, up = case.steps, rule.direction == "up"
+    used = [
+        step
+        for step in steps
+        if step.edit
+        and step.edit.rule == rule.name
+        and step.origin is not None
+        and case.effects.ahead(rule.field, value, up, step.edit.before)
+    ]
     if not used:
         return False
     after = used[-1]
@@ -295,7 +320,7 @@ def _mapped_miss(case: _Case, edit: Edit, step: Step, measure: str) -> bool:
 def _half_way(case: _Case) -> Edit | None:
     """Where the last edit lost trials that had settled: half of it, from where it was made."""
     last = case.steps[-1]
-    if last.edit is None or last.origin is None:
+    if last.edit is None or last.origin is None or last.edit.rule == HALF_WAY or last.edit.measure == "settled":
         return None
     origin = case.steps[last.origin]
     lost = case.requirement.misses(last.measured).get("settled", 0.0)

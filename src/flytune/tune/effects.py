@@ -112,6 +112,14 @@ class Effects:
         first, *others = self.knobs[path].points
         return any(first.apart(other, measure, axis) for other in others for measure in FLOOR)
 
+    def ahead(self, path: str, value: float, up: bool, other: float) -> bool:
+        """Whether a knob that leaves `value` moves between the same two measured values as from `other`; True where
+        it was not measured."""
+        if path not in self.knobs:
+            return True
+        curve = self.knobs[path]
+        return curve.around(value, up) == curve.around(other, up)
+
     def verdict(
         self, path: str, measure: str, direction: Literal["up", "down"], axis: str = "position"
     ) -> Literal["confirmed", "wrong sign", "no effect", "only beyond a threshold"]:

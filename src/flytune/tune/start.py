@@ -21,6 +21,7 @@ from flytune.tune.rules import is_fixed
 TUNING_SEED, TUNING_TRIALS = 3000, 100  # the starts that are looked at again and again
 KNOWN = ("acrobatic-refined", "baseline-refined", "inspection-refined")  # fastest first
 WHERE_NOTHING_FLIES = "baseline-refined"
+SLOW = 4.0  # s, from which on a training looks 5 s ahead
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -109,7 +110,7 @@ def _prepared(task: Task, requirement: Requirement, trainer: str, flies: bool, f
         wanted["horizon"] = (horizon, "tuned: the episodes are longer than the response that is asked for")
     if trainer == "apg":
         wanted["apg.leeway"] = (max(0.5, float(task.apg.leeway)), "tuned: as the refined presets")
-        if requirement.settling_time >= 4:
+        if requirement.settling_time >= SLOW:
             wanted["apg.window"] = (max(500, task.apg.window), "tuned: a slow response is seen whole")
         if flies:
             wanted["apg.updates"] = (200, "tuned: it goes on from a policy that flies")
