@@ -109,7 +109,7 @@ def measure(folder: Path, updates: int, seeds: int, workers: int) -> None:
     """Train what is missing, and put all together."""
     folder.mkdir(parents=True, exist_ok=True)
     plan = folder / "plan.json"
-    asked = {"updates": updates, "base": BASE}
+    asked = {"trainer": "apg", "updates": updates, "base": BASE}
     if plan.exists() and json.loads(plan.read_text(encoding="utf-8")) != asked:
         raise SystemExit(f"{folder}: holds a map of other trainings. Give another folder.")
     plan.write_text(json.dumps(asked), encoding="utf-8")

@@ -43,7 +43,12 @@ TUNING = {
             "seed": 4000,
             "judgement": {
                 "trials": 200,
-                "position": {"settled": 200, "settling_time": {"median": 6.08}, "overshoot": {"median": 0.0}},
+                "position": {
+                    "settled": 200,
+                    "settling_time": {"median": 6.08},
+                    "overshoot": {"median": 0.0},
+                    "steady_state_error": {"median": 0.0031},
+                },
             },
             "misses": {},
         }
@@ -54,10 +59,12 @@ TUNING = {
 def test_every_step_its_reason_and_the_verdict_are_on_the_page(tmp_path):
     write_tuning(tmp_path / "page.html", TUNING)
     read = Reader((tmp_path / "page.html").read_text())
-    for words in ("Met: step 2", "edit 1", "response 1", "6.08 s", "200/200", "4000"):
+    for words in ("Met: step 2", "edit 1", "response 1", "6.08 s", "200/200", "3.1 mm", "4000"):
         assert words in read.text
-    times = read.figures[0]["data"][0]
+    ways, times = read.figures[0]["data"][:2]
     assert times["y"] == [3.0, None, 6.1]
+    assert ways["x"] == [0, 1, None, 1, 2, None]
+    assert ways["y"] == [3.0, None, None, None, 6.1, None]
     bands = [(shape["y0"], shape["y1"]) for shape in read.figures[0]["layout"]["shapes"]]
     assert bands == [pytest.approx((5.4, 6.6)), pytest.approx((0, 5)), pytest.approx((0, 10))]
 

@@ -1,5 +1,6 @@
 """The page of a tuning: what was asked, the response step by step, and the reason for each edit."""
 
+import math
 from collections.abc import Mapping
 from html import escape
 from pathlib import Path
@@ -33,8 +34,9 @@ def _body(tuning: Mapping[str, Any]) -> str:
         else f"{tuning['why'][0].upper()}{tuning['why'][1:]}"
     )
     caption = (
-        "Each point is one policy, judged on the same starts; the green band is what is asked, the filled point the "
-        "policy that was kept. A step without a settling time has too few trials that settle."
+        "Each point is one policy, judged on the same starts; a line leads to it from the one that was edited. The "
+        "green band is what is asked, the filled point the policy that was kept. A step without a settling time has too "
+        "few trials that settle."
     )
     return (
         f"<h1>{escape(tuning['title'])}</h1><p class='lead'>{escape(outcome)}</p>"
@@ -49,7 +51,7 @@ def response_per_step(tuning: Mapping[str, Any]) -> go.Figure:
     asked, lines = tuning["requirement"], tuning["lines"]
     numbers = [line["number"] for line in lines]
     degrees = asked["axis"] == "yaw"
-    scale, unit = (57.29577951308232, "deg") if degrees else (1e3, "mm")
+    scale, unit = (math.degrees(1), "deg") if degrees else (1e3, "mm")
     wanted = asked["settling_time"]
     spread = asked["tolerance"] * wanted
     panels = (
@@ -63,9 +65,18 @@ def response_per_step(tuning: Mapping[str, Any]) -> go.Figure:
         values = [None if line["measured"][name] is None else factor * line["measured"][name] for line in lines]
         kept = [style.TRIALS[0] if number == tuning["best"] else "white" for number in numbers]
         marker = {"size": 9, "color": kept, "line": {"color": style.TRIALS[0], "width": 1.6}}
+        at = dict(zip(numbers, values, strict=True))
+        ways = [(line["origin"], line["number"]) for line in lines if line["origin"] is not None]
         figure.add_trace(
-            go.Scatter(x=numbers, y=values, mode="lines+markers", line={"color": style.TRIALS[0], "width": 1.2},
-                       marker=marker, showlegend=False, hovertemplate="%{y:.3g}"),
+            go.Scatter(x=[end for way in ways for end in (*way, None)],
+                       y=[end for first, second in ways for end in (at[first], at[second], None)],
+                       mode="lines", line={"color": style.TRIALS[0], "width": 1.2}, showlegend=False,
+                       hoverinfo="skip"),
+            row=1, col=column,
+        )  # fmt: skip
+        figure.add_trace(
+            go.Scatter(x=numbers, y=values, mode="markers", marker=marker, showlegend=False,
+                       hovertemplate="%{y:.3g}"),
             row=1, col=column,
         )  # fmt: skip
         # after the trace: plotly leaves an empty panel without it
@@ -97,16 +108,23 @@ def _verdicts(tuning: Mapping[str, Any]) -> str:
             f"<tr><th>{verdict['step']}</th><td>{verdict['seed']}</td>"
             f"<td>{'-' if median is None else f'{median:.2f} s'}</td>"
             f"<td>{channel['settled']}/{judged['trials']}</td><td>{_percent(channel['overshoot']['median'])}</td>"
-            f"<td>{escape(', '.join(verdict['misses'])) or 'nothing'}</td></tr>"
+            f"<td>{_error(channel['steady_state_error']['median'], axis)}</td>"
+            f"<td>{escape(', '.join(verdict['misses']).replace('_', ' ')) or 'nothing'}</td></tr>"
         )
     if not rows:
         return '<p class="empty">No step came near enough to be judged on fresh starts.</p>'
     head = (
         "<tr><th>step</th><th>seed of the starts</th><th>settling time, median</th><th>settled</th>"
-        "<th>overshoot, median</th><th>missing</th></tr>"
+        "<th>overshoot, median</th><th>error, median</th><th>missing</th></tr>"
     )
     return f'<div class="wide"><table><thead>{head}</thead><tbody>{"".join(rows)}</tbody></table></div>'
 
 
 def _percent(value: float | None) -> str:
     return "-" if value is None else f"{100 * value:.1f} %"
+
+
+def _error(value: float | None, axis: str) -> str:
+    if value is None:
+        return "-"
+    return f"{math.degrees(value):.2f} deg" if axis == "yaw" else f"{1e3 * value:.1f} mm"

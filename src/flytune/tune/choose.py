@@ -36,7 +36,7 @@ class _Case:
     @property
     def mapped(self) -> bool:
         """Whether the effect map is of this trainer, so that an effect it did not find is not there."""
-        return self.trainer == self.effects.facts.get("trainer", "apg")
+        return self.trainer == self.effects.facts["trainer"]
 
 
 def choose(
