@@ -27,7 +27,7 @@ def test_what_a_known_policy_already_does_takes_no_training(tmp_path):
     assert result.met
     assert result.best == 0
     assert result.start == "baseline-refined"
-    assert [line.split()[0] for line in said] == ["asked", "on", "start", "step", "fresh", "done"]
+    assert [line.split()[0] for line in said] == ["asked", "tuning", "start", "step", "fresh", "done"]
     pilot = find_pilot(str(tmp_path / "t"))
     assert judge(fly(pilot.controller, pilot.task, seed=7)).settled("position") == 100
 

@@ -35,8 +35,8 @@ def _body(tuning: Mapping[str, Any]) -> str:
     )
     caption = (
         "Each point is one policy, judged on the same starts; a line leads to it from the one that was edited. The "
-        "green band is what is asked, the filled point the policy that was kept. A step without a settling time has too "
-        "few trials that settle."
+        "green band is what is asked, the filled point the policy that was kept. A step without a settling time has "
+        "too few trials that settle."
     )
     return (
         f"<h1>{escape(tuning['title'])}</h1><p class='lead'>{escape(outcome)}</p>"

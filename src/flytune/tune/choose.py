@@ -142,25 +142,21 @@ def _edit(case: _Case, rule: Rule, step: Step) -> Edit | str:
         return f"not while the {' and the '.join(missed).replace('_', ' ')} is missed"
     if case.mapped and not case.effects.moves(rule.field, axis):
         return "measured to move nothing"
-    slope, known_from = _slope(case, rule, value, step)
-    if slope is None:
-        return known_from
-    if known_from != "flown" and _disappointed(case, rule, value):
+    slope = _slope(case, rule, value, step)
+    if isinstance(slope, str):
+        return slope
+    if slope.known_from != "flown" and _disappointed(case, rule, value):
         return "it was tried, and did not help"
-    aim = math.nan if rule.measure in ("settled", "kept") else _aim(rule.measure, case.requirement, case.margin)
     now = getattr(step.measured, rule.measure)
     up = 1 if rule.direction == "up" else -1
     expects: float | None
     if rule.measure in ("settled", "kept") or not math.isfinite(now):
         after, gain, expects = moved(rule, value, float(rule.largest) ** up), 0.5, None
     else:
-        wanted = math.log(aim / max(now, 1e-9))
-        factor = math.exp(max(-3.0, min(3.0, wanted / slope)))
-        bracketed = _between(rule, step, case.steps, aim) if rule.measure == "settling_time" else None
-        if bracketed and abs(math.log(bracketed / value)) > 1e-9:
-            factor, slope, known_from = bracketed / value, wanted / math.log(bracketed / value), "between"
-        after = moved(rule, value, factor)
-        promised = slope * math.log(after / value)
+        wanted = math.log(_aim(rule.measure, case.requirement, case.margin) / max(now, 1e-9))
+        slope = _interpolated(case, rule, step, value, wanted, slope)
+        after = moved(rule, value, math.exp(max(-3.0, min(3.0, wanted / slope.power))))
+        promised = slope.power * math.log(after / value)
         gain = min(1.0, promised / wanted) if wanted else 0.0
         expects = now * math.exp(promised)
     if (after - value) * up <= 0 or abs(after / value - 1) < 0.002:
@@ -177,8 +173,9 @@ def _edit(case: _Case, rule: Rule, step: Step) -> Edit | str:
         after=after,
         unit=document.unit_of(Task, case.tables, rule.field),
         expects=expects,
-        slope=slope,
-        known_from=known_from,
+        slope=slope.power,
+        known_from=slope.known_from,
+        ends=slope.ends,
         gain=gain,
     )
 
@@ -212,36 +209,66 @@ def _value(step: Step, field: str, steps: Sequence[Step]) -> float | None:
     return next((each.edit.before for each in steps if each.edit and each.edit.field == field), None)
 
 
-def _slope(case: _Case, rule: Rule, value: float, step: Step) -> tuple[float | None, str]:
-    """d log(measure) / d log(field) and where it is known from; None and the reason where the rule does not hold."""
-    what = (rule.field, rule.measure, value, case.requirement.axis, rule.direction == "up")
-    measured = case.effects.elasticity(*what) if rule.measure in MEASURES else None
-    holds = measured is not None and measured * rule.slope > 0 and case.effects.matters(*what)
+@dataclasses.dataclass(frozen=True)
+class _Slope:
+    """How a measure goes with a field: as its value to this power."""
+
+    power: float  # d log(measure) / d log(field)
+    known_from: str
+    ends: tuple[float, float] | None  # values of the field it was measured between
+
+
+def _slope(case: _Case, rule: Rule, value: float, step: Step) -> _Slope | str:
+    """How the rule's measure goes with its field there; or why the rule does not hold there."""
+    up = rule.direction == "up"
+    what = (rule.field, rule.measure, value, case.requirement.axis, up)
+    mapped = case.effects.elasticity(*what) if rule.measure in MEASURES else None
+    holds = mapped is not None and mapped * rule.slope > 0 and case.effects.matters(*what)
     flown = []
     for other in case.steps:
         there = _value(other, rule.field, case.steps)
-        if other is step or there is None or not _alike(step, other, rule.field) or abs(math.log(there / value)) < 0.02:
+        if other is step or there is None or not _alike(step, other, rule.field) or abs(math.log(there / value)) < SAME:
             continue
         now, then = (getattr(each.measured, rule.measure) for each in (step, other))
         if now > 0 and then > 0 and math.isfinite(now) and math.isfinite(then):
             flown.append((abs(math.log(there / value)), math.log(then / now) / math.log(there / value), there))
     if flown:
-        _, found, there = min(flown)
+        _, power, there = min(flown)
         # where the map knows of a threshold ahead, what was flown before it says nothing of what comes after
-        feeble = holds and measured is not None and abs(found) < FEEBLE * abs(measured)
-        told = not feeble or case.effects.ahead(rule.field, value, rule.direction == "up", there)
-        if told and found * rule.slope > 0 and abs(found) > 0.1 * abs(float(rule.slope)):
-            return found, "flown"
-    if holds:
-        return measured, "map"
-    if measured is None or not case.mapped:
-        return float(rule.slope), "rule"
+        feeble = holds and mapped is not None and abs(power) < FEEBLE * abs(mapped)
+        told = not feeble or case.effects.ahead(rule.field, value, up, there)
+        if told and power * rule.slope > 0 and abs(power) > 0.1 * abs(float(rule.slope)):
+            return _Slope(power, "flown", (value, there))
+    if holds and mapped is not None:
+        low, high = case.effects.knobs[rule.field].around(value, up)
+        return _Slope(mapped, "map", (low.value, high.value))
+    if mapped is None or not case.mapped:
+        return _Slope(float(rule.slope), "rule", None)
     nothing = not case.effects.matters(*what)
-    return None, f"measured to have {'no effect' if nothing else 'the opposite effect'} there"
+    return f"measured to have {'no effect' if nothing else 'the opposite effect'} there"
 
 
-def _between(rule: Rule, step: Step, steps: Sequence[Step], aim: float) -> float | None:
-    """The field's value between the nearest faster and slower steps, on a line in logarithms; None without both.
+def _interpolated(case: _Case, rule: Rule, step: Step, value: float, wanted: float, slope: _Slope) -> _Slope:
+    """The slope of the way to a value between a faster and a slower step, where there are both.
+
+    The slope from a step that lies behind stays, if it leads between them.
+    """
+    ends = _ends(rule, step, case.steps, case.requirement.aim()) if rule.measure == "settling_time" else None
+    if ends is None:
+        return slope
+    slow, fast, share = ends
+    goal = slow + share * (fast - slow)
+    way = wanted / slope.power
+    inside = 0.05 < (math.log(value) + way - slow) / (fast - slow) < 0.95
+    behind = slope.known_from == "flown" and slope.ends is not None and math.log(slope.ends[1] / value) * way < 0
+    if (behind and inside) or abs(goal - math.log(value)) < 1e-9:
+        return slope
+    return _Slope(wanted / (goal - math.log(value)), "between", (math.exp(slow), math.exp(fast)))
+
+
+def _ends(rule: Rule, step: Step, steps: Sequence[Step], aim: float) -> tuple[float, float, float] | None:
+    """The logarithms of the field in the nearest slower and faster steps, and how far to go from the one to the other;
+    None without both.
 
     Where one end stays while step after step falls on the other side, it counts half as much each time: a curve that
     bends would else be followed in ever smaller steps (the Illinois variant of the false position method).
@@ -262,8 +289,7 @@ def _between(rule: Rule, step: Step, steps: Sequence[Step], aim: float) -> float
     (late, slow, _), (early, fast, _) = ends = min(slower), max(faster)
     stays = [sum(each[2] > end[2] for each in others) - 1 for end, others in zip(ends, (faster, slower), strict=True)]
     late, early = (off * 0.5 ** max(0, count) for off, count in zip((late, early), stays, strict=True))
-    share = late / (late - early)
-    return math.exp(slow + max(0.1, min(0.9, share)) * (fast - slow))
+    return slow, fast, max(0.1, min(0.9, late / (late - early)))
 
 
 def _disappointed(case: _Case, rule: Rule, value: float) -> bool:

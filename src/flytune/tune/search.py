@@ -21,7 +21,7 @@ from flytune.tune.result import Tuning, Verdict
 from flytune.tune.rules import Rule
 from flytune.tune.start import TUNING_SEED, TUNING_TRIALS, edited, find_start, fly_for, tuning_duration
 from flytune.tune.step import Edit, Step
-from flytune.tune.words import describe, describe_edit, describe_miss, describe_step, said_of
+from flytune.tune.words import describe, describe_edit, describe_miss, describe_step, describe_targets, said_of
 
 FRESH_SEED, FRESH_TRIALS = 4000, 200  # the starts of a verdict; each verdict has its own
 MOST_STEPS = 12
@@ -75,8 +75,11 @@ class Tuner:
     def run(self) -> Tuning:
         """Steps until the requirement is met on fresh starts, or nothing can help."""
         self.tell(f"asked    {self.requirement}")
-        self.tell(f"         on the tuning starts {100 * MARGIN:.0f} % of the tolerance and of the bounds is allowed, "
-                  "so that fresh starts do not disappoint")  # fmt: skip
+        self.tell(f"tuning   for {describe_targets(self.requirement, TUNING_TRIALS, self.duration)}")
+        if self.edits:
+            fixed = ", ".join(f"{path} = {value}" for path, value in self.edits.items())
+            kept = f"; kept in {100 * self.requirement.settled:g} % of the trials: {', '.join(self.bounds)}"
+            self.tell(f"fixed    by you: {fixed}{kept if self.bounds else ''}")
         for step in self.steps:
             self._say(step)
         if not self.steps:
@@ -143,8 +146,8 @@ class Tuner:
             return
         times = ", ".join(f"{name} {said_of('settling_time', time, self.requirement)}"
                           for name, time in start.times.items())  # fmt: skip
-        nearest = f": {start.name} is nearest" if len(start.times) > 1 else ""
-        self.tell(f"start    known tasks as they fly: {times}{nearest}")
+        nearest = f"; {start.name} is nearest, as a ratio" if len(start.times) > 1 else ""
+        self.tell(f"start    known tasks, as their policies settle: {times}{nearest}")
         folder = self._folder(0)
         folder.mkdir(parents=True, exist_ok=True)
         shutil.copyfile(start.files[0], folder / "policy.safetensors")
@@ -157,8 +160,8 @@ class Tuner:
 
     def _take(self, origin: Step, edit: Edit) -> None:
         number = len(self.steps)
-        back = "" if origin is self.steps[-1] else f"back at step {origin.number}, "
-        self.tell(f"edit {number:<3} {back}{describe_edit(edit, self.requirement)}")
+        back = "" if origin is self.steps[-1] else "back "
+        self.tell(f"edit {number:<3} {back}on step {origin.number}, {describe_edit(edit, self.requirement)}")
         so_far = origin.reasons.get(edit.field, f"tuned: {edit.before:g}").split(",")[0]
         why = f"{so_far} -> {edit.after:g}, {edit.condition}: {edit.says} ({edit.rule}, {edit.source})"
         values, reasons = {**origin.values, edit.field: edit.after}, {**origin.reasons, edit.field: why}

@@ -25,6 +25,7 @@ class Edit:
     expects: float | None  # of the rule's measure; None where no number can be promised
     slope: float  # d log(measure) / d log(field) that is counted on
     known_from: str  # flown, between, map or rule
+    ends: tuple[float, float] | None  # values of the field that the slope was measured between
     gain: float  # share of what is missing of the measure that the edit promises, 1 at most
     second: "Edit | None" = None  # of another field, the next best
 
@@ -60,4 +61,7 @@ class Step:
 
 def read_edit(data: dict[str, Any] | None) -> Edit | None:
     """An edit from its plain values, None from None."""
-    return Edit(**{**data, "second": read_edit(data["second"])}) if data else None
+    if not data:
+        return None
+    ends = tuple(data["ends"]) if data["ends"] else None
+    return Edit(**{**data, "ends": ends, "second": read_edit(data["second"])})

@@ -5,32 +5,44 @@ import math
 from flytune.tune.requirement import MARGIN, Measured, Requirement
 from flytune.tune.step import HALF_WAY, Edit, Step
 
-NAMES = {"settling_time": "settling time"}
-
 
 def describe(measured: Measured, requirement: Requirement, notes: dict[str, str] | None = None) -> str:
     """A measured response in words; `notes` says more of a measure."""
-    shown = ["settling_time", "overshoot", "error", "settled", *(["kept"] if measured.kept < 1 else [])]
-    said = {name: said_of(name, getattr(measured, name), requirement) for name in shown}
     settles = math.isfinite(measured.settling_time)
+    said = {name: said_of(name, getattr(measured, name), requirement) for name in vars(measured)}
     words = {
         "settling_time": f"settles in {said['settling_time']}" if settles else "does not settle",
         "overshoot": f"overshoot {said['overshoot']}",
         "error": f"error {said['error']}",
         "settled": f"{said['settled']} settled",
-        "kept": f"own bounds kept in {said.get('kept')}",
+        "kept": f"your bounds kept in {said['kept']}",
     }
+    shown = [name for name in words if name != "kept" or measured.kept < 1 or "kept" in (notes or {})]
     return ", ".join(words[name] + (notes or {}).get(name, "") for name in shown)
+
+
+def describe_targets(requirement: Requirement, trials: int, duration: float) -> str:
+    """What is asked on the tuning starts, where only a share of the tolerance and of the bounds is allowed."""
+    spread = MARGIN * requirement.tolerance
+    low, high = ((1 - spread) * requirement.settling_time, (1 + spread) * requirement.settling_time)
+    time = f"at most {low:.2f} s" if requirement.at_most else f"{low:.2f} to {high:.2f} s"
+    band = "3.6 deg" if requirement.axis == "yaw" else "2 cm"
+    return (
+        f"{time}, overshoot at most {said_of('overshoot', MARGIN * requirement.overshoot, requirement)}, error at most "
+        f"{said_of('error', MARGIN * requirement.error, requirement)} in {trials} trials of {duration:g} s; settled is "
+        f"within {band} to the end, a trial that does not settle counts as infinitely slow"
+    )
 
 
 def describe_edit(edit: Edit, requirement: Requirement) -> str:
     """An edit in one line: what is missing, the edit, what is expected and why so, the rule, and the next best edit."""
     condition = "too far" if edit.rule == HALF_WAY else edit.condition
     known = f" ({_known(edit)})" if _known(edit) else ""
+    source = "" if edit.rule.startswith(f"{edit.source.removeprefix('paper ')} ") else f" ({edit.source})"
     second = ""
-    if edit.second is not None:
-        second = f". Next best: {edit.second.rule}, {_change(edit.second, requirement)}"
-    return f"{condition}: {_change(edit, requirement)}{known}. {edit.rule}: {edit.says} ({edit.source}){second}"
+    if edit.second is not None and edit.second.expects is not None:
+        second = f". Next best: {_change(edit.second, requirement)} ({edit.second.rule})"
+    return f"{condition}: {_change(edit, requirement)}{known}. {edit.rule}: {edit.says}{source}{second}"
 
 
 def describe_step(step: Step, before: Measured | None, requirement: Requirement) -> str:
@@ -66,8 +78,12 @@ def said_of(measure: str, value: float, requirement: Requirement) -> str:
     if measure == "settling_time":
         return f"{value:.2f} s"
     if measure == "error":
-        return f"{math.degrees(value):.2f} deg" if requirement.axis == "yaw" else f"{1e3 * value:.1f} mm"
+        return f"{math.degrees(value):.2f} deg" if requirement.axis == "yaw" else f"{1e3 * value:.2f} mm"
     return f"{100 * value:.1f} %"
+
+
+def _named(measure: str) -> str:
+    return measure.replace("_", " ")
 
 
 def _change(edit: Edit, requirement: Requirement) -> str:
@@ -75,19 +91,23 @@ def _change(edit: Edit, requirement: Requirement) -> str:
     unit = f" {edit.unit}" if edit.unit and "unit(" not in edit.unit else ""
     expects = ""
     if edit.expects is not None:
-        expects = (
-            f", expects {NAMES.get(edit.measure, edit.measure)} {said_of(edit.measure, edit.expects, requirement)}"
-        )
+        expects = f", expects {_named(edit.measure)} {said_of(edit.measure, edit.expects, requirement)}"
     return f"{edit.field} {edit.before:g} -> {edit.after:g}{unit}{expects}"
 
 
 def _known(edit: Edit) -> str:
-    """Where the size of an edit comes from, with the slope it counts on."""
+    """Where the size of an edit comes from: the power law it counts on, and what that was measured between."""
     if edit.rule == HALF_WAY:
-        return "half of the last edit"
-    if edit.known_from == "between":
-        return "between the steps on both sides"
+        return f"half-way back to {edit.before:g}, in logarithms"
     if edit.expects is None:
-        return "the rule's largest step"
-    known = {"flown": "steps so far", "map": "effect map", "rule": "the rule's own guess"}[edit.known_from]
-    return f"{known}: {NAMES.get(edit.measure, edit.measure)} goes as the field to the power {edit.slope:.2g}"
+        return "no number can be promised: the rule's largest step"
+    law = f"{_named(edit.measure)} ~ {edit.field.split('.')[-1]}^{edit.slope:.2g}"
+    if edit.ends is None:
+        return f"{law}, the rule's own guess, not measured"
+    low, high = sorted(edit.ends)
+    where = {
+        "flown": f"{law} in the steps at {low:g} and {high:g}",
+        "map": f"{law} between {low:g} and {high:g} of the effect map",
+        "between": f"interpolated between the steps at {low:.3g} and {high:.3g}, one too slow and one too fast",
+    }
+    return where[edit.known_from]
