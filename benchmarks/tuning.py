@@ -138,7 +138,6 @@ def search(tuner: Any, method: str, seed: int) -> bool:
     """Whether Optuna meets what the tuner is asked for, from the policy the tuner begins with, within the budget."""
     import optuna
 
-    from flytune.tune.requirement import MARGIN
     from flytune.tune.rules import field_of
 
     optuna.logging.set_verbosity(optuna.logging.WARNING)
@@ -169,7 +168,7 @@ def search(tuner: Any, method: str, seed: int) -> bool:
     )
     while True:
         step = tuner.steps[-1]
-        if not requirement.misses(step.measured, MARGIN) and not tuner.verdict(step).misses:
+        if not tuner.target.misses(step.measured) and not tuner.verdict(step).misses:
             return True
         if len(tuner.steps) > BUDGET:
             return False

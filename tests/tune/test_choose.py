@@ -84,7 +84,7 @@ def test_a_curve_that_bends_is_not_followed_in_ever_smaller_steps():
     wanted = make_requirement(3, tolerance=5)
     only = [rule for rule in RULES if rule.field == SPEED]
     steps = [step(settling_time=flown(0.8)), step(1, {SPEED: 0.3}, None, 0, settling_time=flown(0.3))]
-    while wanted.misses(steps[-1].measured, 0.5):
+    while wanted.misses(steps[-1].measured):
         origin, edit = chosen(steps, wanted, rules=only)
         values = {SPEED: edit.after}
         steps = [*steps, step(len(steps), values, edit, origin.number, settling_time=flown(edit.after))]

@@ -75,11 +75,14 @@ def test_an_upper_bound_has_no_lower_side_and_no_tolerance():
     assert set(wanted.misses(but(settling_time=2.51))) == {"settling_time"}
 
 
-def test_a_margin_asks_for_more_of_everything_but_the_shares():
+def test_the_tuning_starts_are_asked_for_more_of_everything_but_the_shares():
     wanted = make_requirement(2.5)
-    barely = but(settling_time=2.7, overshoot=0.04, error=0.008, settled=0.99)
+    barely = but(settling_time=2.7, overshoot=0.045, error=0.009, settled=0.99)
     assert not wanted.misses(barely)
-    assert set(wanted.misses(barely, 0.5)) == {"settling_time", "overshoot", "error"}
+    assert set(wanted.narrowed().misses(barely)) == {"settling_time", "overshoot", "error"}
+    early = make_requirement(2.5, at_most=True).narrowed()
+    assert early.latest() == pytest.approx(2.375)
+    assert early.aim() < early.latest()
 
 
 def test_too_slow_is_positive_and_too_fast_negative():

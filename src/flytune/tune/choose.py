@@ -8,7 +8,7 @@ from typing import Any
 from flytune import document
 from flytune.task.task import Task
 from flytune.tune.effects import FLOOR, Effects
-from flytune.tune.requirement import MARGIN, Requirement
+from flytune.tune.requirement import Requirement
 from flytune.tune.rules import Rule, conditions, field_of, is_fixed, moved
 from flytune.tune.step import HALF_WAY, Edit, Step
 
@@ -30,7 +30,6 @@ class _Case:
     rules: Sequence[Rule]
     effects: Effects
     fixed: Sequence[str]
-    margin: float
     trainer: str
 
     @property
@@ -46,7 +45,6 @@ def choose(
     rules: Sequence[Rule],
     effects: Effects,
     fixed: Sequence[str],
-    margin: float = MARGIN,
     trainer: str = "apg",
 ) -> tuple[Step, Edit] | list[str]:
     """The step to go on from and its edit; where no rule can help, why not, one line for each that was looked at.
@@ -54,14 +52,13 @@ def choose(
     Args:
         steps: all so far, the first one the start.
         tables: the task of the start, as nested tables.
-        requirement: what is wanted.
+        requirement: what is wanted of the starts the steps were measured on.
         rules: those that may be used.
         effects: what each knob was measured to do.
         fixed: field paths the user has set; they, and what lies under them, are not touched.
-        margin: the share of the tolerance that counts as met.
         trainer: apg or ppo; rules for settings of the other are left out.
     """
-    case = _Case(steps, tables, requirement, rules, effects, fixed, margin, trainer)
+    case = _Case(steps, tables, requirement, rules, effects, fixed, trainer)
     if (edit := _half_way(case)) is not None:
         return steps[steps[-1].origin or 0], edit
     nearest = min(steps, key=lambda step: (_left(case, step), -step.number))
@@ -81,7 +78,7 @@ def choose(
 
 def _left(case: _Case, step: Step) -> float:
     """How far a step is from what is wanted."""
-    return sum(case.requirement.parts(step.measured, case.margin).values())
+    return sum(case.requirement.parts(step.measured).values())
 
 
 def _options(case: _Case, step: Step) -> tuple[list[tuple[float, Edit]], dict[str, list[str]]]:
@@ -89,7 +86,7 @@ def _options(case: _Case, step: Step) -> tuple[list[tuple[float, Edit]], dict[st
     condition, why not the others."""
     found: list[tuple[float, Edit]] = []
     refused: dict[str, list[str]] = {}
-    for condition in conditions(case.requirement.misses(step.measured, case.margin)):
+    for condition in conditions(case.requirement.misses(step.measured)):
         for rule in case.rules:
             if rule.advice or rule.when != condition:
                 continue
@@ -109,12 +106,12 @@ def _left_after(case: _Case, step: Step, edit: Edit) -> tuple[float, str]:
     trusted; of the other measures it becomes what it is in the step flown nearest to where the edit goes, or, where
     there is none, what the effect map warns of.
     """
-    parts = case.requirement.parts(step.measured, case.margin)
+    parts = case.requirement.parts(step.measured)
     own, before = parts[edit.measure], sum(parts.values())
     gain = edit.gain * TRUST[edit.known_from] - EFFORT * abs(math.log(edit.after / edit.before))
     nearby = _nearby(case, edit, step)
     if nearby is not None:
-        there = case.requirement.parts(nearby.measured, case.margin)
+        there = case.requirement.parts(nearby.measured)
         worse = {name: there[name] - parts.get(name, 0.0) for name in there if name != edit.measure}
         harm = {name: more for name, more in worse.items() if more > 0}
     else:
@@ -129,7 +126,7 @@ def _left_after(case: _Case, step: Step, edit: Edit) -> tuple[float, str]:
 
 def _edit(case: _Case, rule: Rule, step: Step) -> Edit | str:
     """The edit a rule asks for, or why the rule is not used."""
-    misses = case.requirement.misses(step.measured, case.margin)
+    misses = case.requirement.misses(step.measured)
     axis = case.requirement.axis
     if rule.field.split(".")[0] in {"apg", "ppo"} - {case.trainer}:
         return f"{rule.field} is of another trainer"
@@ -153,7 +150,7 @@ def _edit(case: _Case, rule: Rule, step: Step) -> Edit | str:
     if rule.measure in ("settled", "kept") or not math.isfinite(now):
         after, gain, expects = moved(rule, value, float(rule.largest) ** up), 0.5, None
     else:
-        wanted = math.log(_aim(rule.measure, case.requirement, case.margin) / max(now, 1e-9))
+        wanted = math.log(_aim(rule.measure, case.requirement) / max(now, 1e-9))
         slope = _interpolated(case, rule, step, value, wanted, slope)
         after = moved(rule, value, math.exp(max(-3.0, min(3.0, wanted / slope.power))))
         promised = slope.power * math.log(after / value)
@@ -180,11 +177,11 @@ def _edit(case: _Case, rule: Rule, step: Step) -> Edit | str:
     )
 
 
-def _aim(measure: str, requirement: Requirement, margin: float) -> float:
+def _aim(measure: str, requirement: Requirement) -> float:
     """Where to steer a measure to: the settling time itself, half of what is allowed for the others."""
     if measure == "settling_time":
         return requirement.aim()
-    return 0.5 * margin * max(getattr(requirement, measure), 1e-3)
+    return 0.5 * max(getattr(requirement, measure), 1e-3)
 
 
 def _alike(first: Step, second: Step, field: str) -> bool:

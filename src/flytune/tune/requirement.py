@@ -13,7 +13,7 @@ from flytune.response.statistics import quantile
 
 AXES = ("position", "x", "y", "z", "yaw")
 LONGEST = 60.0  # s
-MARGIN = 0.5  # what is asked on the tuning starts, as a share of the tolerance or bound that is allowed on fresh ones
+TUNING_TOLERANCE, TUNING_BOUNDS = 0.5, 0.8  # shares of what is allowed on fresh starts that the tuning starts may take
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -56,6 +56,18 @@ class Requirement:
         """The longest settling time in s that still meets the requirement."""
         return self.settling_time * (1.0 if self.at_most else 1.0 + self.tolerance)
 
+    def narrowed(self) -> "Requirement":
+        """What is asked on the tuning starts, so that fresh ones rarely disappoint: half of the tolerance, 80 % of the
+        bounds; `settled` as it is."""
+        tolerance = TUNING_TOLERANCE * self.tolerance
+        return dataclasses.replace(
+            self,
+            settling_time=self.settling_time * (1.0 - tolerance if self.at_most else 1.0),
+            tolerance=tolerance,
+            overshoot=TUNING_BOUNDS * self.overshoot,
+            error=TUNING_BOUNDS * self.error,
+        )
+
     def aim(self) -> float:
         """The settling time in s to steer for."""
         return self.settling_time * (1.0 - self.tolerance / 2 if self.at_most else 1.0)
@@ -80,11 +92,10 @@ class Requirement:
             kept=float(1 - np.mean(broken[feasible])) if feasible.any() else 1.0,
         )
 
-    def misses(self, measured: Measured, margin: float = 1.0) -> dict[str, float]:
+    def misses(self, measured: Measured) -> dict[str, float]:
         """What is missing: measure -> by how much, as a logarithm for the settling time and a share for the others.
 
-        Positive means too much, negative too little. Empty where the requirement is met. `margin` below 1 narrows the
-        tolerance and the bounds to that share, `settled` and `kept` apart.
+        Positive means too much, negative too little. Empty where the requirement is met.
         """
         found: dict[str, float] = {}
         if measured.settled < self.settled:
@@ -92,23 +103,22 @@ class Requirement:
         if measured.kept < self.settled:
             found["kept"] = measured.kept - self.settled
         ratio = measured.settling_time / self.settling_time
-        upper = 1 - (1 - margin) * self.tolerance if self.at_most else 1 + margin * self.tolerance
-        if ratio > upper or (not self.at_most and ratio < 1 - margin * self.tolerance):
+        if measured.settling_time > self.latest() or (not self.at_most and ratio < 1 - self.tolerance):
             found["settling_time"] = math.log(measured.settling_time / self.aim())
-        if measured.overshoot > margin * self.overshoot:
-            found["overshoot"] = measured.overshoot - margin * self.overshoot
-        if measured.error > margin * self.error:
-            found["error"] = math.log(measured.error / (margin * self.error))
+        if measured.overshoot > self.overshoot:
+            found["overshoot"] = measured.overshoot - self.overshoot
+        if measured.error > self.error:
+            found["error"] = math.log(measured.error / self.error)
         return found
 
-    def parts(self, measured: Measured, margin: float = 1.0) -> dict[str, float]:
+    def parts(self, measured: Measured) -> dict[str, float]:
         """How far a response is from the requirement, by measure; empty where it is met.
 
         In units that can be added: 1 is a settling time off by a factor of e, a fifth of the trials that do not
         settle or break a bound, a fifth of the step too much overshoot, or an error too large by a factor of e^2.
         """
         sizes = {"settled": 5.0, "kept": 5.0, "settling_time": 1.0, "overshoot": 5.0, "error": 0.5}
-        return {name: sizes[name] * min(abs(size), 10.0) for name, size in self.misses(measured, margin).items()}
+        return {name: sizes[name] * min(abs(size), 10.0) for name, size in self.misses(measured).items()}
 
     def distance(self, measured: Measured) -> float:
         """One number for how far a response is from the requirement, 0 where it is met: to find the best of several."""

@@ -45,15 +45,15 @@ class Tuning:
 
     def to_dict(self) -> dict[str, Any]:
         """Plain values, for a page: `lines` is what was said of each step."""
-        lines = []
+        lines, target = [], self.requirement.narrowed()
         for step in self.steps:
             before = self.steps[step.origin].measured if step.origin is not None else None
             lines.append(
                 {
                     "number": step.number,
                     "origin": step.origin,
-                    "edit": describe_edit(step.edit, self.requirement) if step.edit else f"start: {self.start}",
-                    "response": describe_step(step, before, self.requirement),
+                    "edit": describe_edit(step.edit, target) if step.edit else f"start: {self.start}",
+                    "response": describe_step(step, before, target),
                     "seconds": step.seconds,
                     "measured": step.measured.to_dict(),
                 }

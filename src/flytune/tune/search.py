@@ -16,7 +16,7 @@ from flytune.learn.run import Progress, train
 from flytune.task.task import Task, load_task, preset_names, write_task
 from flytune.tune.choose import choose
 from flytune.tune.effects import load_effects
-from flytune.tune.requirement import MARGIN, Measured, Requirement
+from flytune.tune.requirement import Measured, Requirement
 from flytune.tune.result import Tuning, Verdict
 from flytune.tune.rules import Rule
 from flytune.tune.start import TUNING_SEED, TUNING_TRIALS, edited, find_start, fly_for, tuning_duration
@@ -58,6 +58,7 @@ class Tuner:
             "requirement": requirement.to_dict(), "task": task, "edits": self.edits, "seed": seed,
             "trainer": trainer, "rules": [dataclasses.asdict(rule) for rule in rules],
         }  # fmt: skip
+        self.target = requirement.narrowed()  # on the tuning starts
         self.duration = tuning_duration(requirement)
         self.effects = load_effects()
         self.steps: list[Step] = []
@@ -75,7 +76,7 @@ class Tuner:
     def run(self) -> Tuning:
         """Steps until the requirement is met on fresh starts, or nothing can help."""
         self.tell(f"asked    {self.requirement}")
-        self.tell(f"tuning   for {describe_targets(self.requirement, TUNING_TRIALS, self.duration)}")
+        self.tell(f"tuning   for {describe_targets(self.target, TUNING_TRIALS, self.duration)}")
         if self.edits:
             fixed = ", ".join(f"{path} = {value}" for path, value in self.edits.items())
             kept = f"; kept in {100 * self.requirement.settled:g} % of the trials: {', '.join(self.bounds)}"
@@ -95,7 +96,7 @@ class Tuner:
             if len(self.steps) > self.most_steps:
                 blocked = [f"{self.most_steps} edits were made, as many as are allowed"]
                 break
-            chosen = choose(self.steps, self.tables, self.requirement, self.rules, self.effects, self.fixed,
+            chosen = choose(self.steps, self.tables, self.target, self.rules, self.effects, self.fixed,
                             trainer=self.trainer)  # fmt: skip
             if isinstance(chosen, list):
                 blocked = chosen
@@ -109,7 +110,7 @@ class Tuner:
     def _is_ready(self, step: Step) -> bool:
         """Whether a step meets the requirement on all tuning starts, and was not judged too often."""
         judged = sum(verdict.step == step.number for verdict in self.verdicts)
-        return judged < MOST_VERDICTS and not self.requirement.misses(step.measured, MARGIN)
+        return judged < MOST_VERDICTS and not self.target.misses(step.measured)
 
     def _starts(self) -> list[tuple[int, int]]:
         """Seed and number of every set of tuning starts: those of a verdict that disappointed have become some."""
@@ -134,7 +135,7 @@ class Tuner:
             if step.number == self.verdicts[-1].step:
                 trials = sum(number for _, number in starts)
                 self.tell(f"again    step {step.number} on all {trials} starts seen so far, tuning starts from now on: "
-                          f"{describe_step(self.steps[index], None, self.requirement)}")  # fmt: skip
+                          f"{describe_step(self.steps[index], None, self.target)}")  # fmt: skip
         self._write()
 
     def begin(self) -> None:
@@ -161,7 +162,7 @@ class Tuner:
     def _take(self, origin: Step, edit: Edit) -> None:
         number = len(self.steps)
         back = "" if origin is self.steps[-1] else "back "
-        self.tell(f"edit {number:<3} {back}on step {origin.number}, {describe_edit(edit, self.requirement)}")
+        self.tell(f"edit {number:<3} {back}on step {origin.number}, {describe_edit(edit, self.target)}")
         so_far = origin.reasons.get(edit.field, f"tuned: {edit.before:g}").split(",")[0]
         why = f"{so_far} -> {edit.after:g}, {edit.condition}: {edit.says} ({edit.rule}, {edit.source})"
         values, reasons = {**origin.values, edit.field: edit.after}, {**origin.reasons, edit.field: why}
@@ -207,7 +208,7 @@ class Tuner:
 
     def _say(self, step: Step) -> None:
         before = self.steps[step.origin].measured if step.origin is not None else None
-        self.tell(f"step {step.number:<3} {describe_step(step, before, self.requirement)}")
+        self.tell(f"step {step.number:<3} {describe_step(step, before, self.target)}")
 
     def verdict(self, step: Step) -> Verdict:
         """The step on starts of its own."""

@@ -2,7 +2,7 @@
 
 import math
 
-from flytune.tune.requirement import MARGIN, Measured, Requirement
+from flytune.tune.requirement import Measured, Requirement
 from flytune.tune.step import HALF_WAY, Edit, Step
 
 
@@ -22,14 +22,15 @@ def describe(measured: Measured, requirement: Requirement, notes: dict[str, str]
 
 
 def describe_targets(requirement: Requirement, trials: int, duration: float) -> str:
-    """What is asked on the tuning starts, where only a share of the tolerance and of the bounds is allowed."""
-    spread = MARGIN * requirement.tolerance
-    low, high = ((1 - spread) * requirement.settling_time, (1 + spread) * requirement.settling_time)
-    time = f"at most {low:.2f} s" if requirement.at_most else f"{low:.2f} to {high:.2f} s"
+    """What is asked on the tuning starts, and what that means."""
+    low = (1 - requirement.tolerance) * requirement.settling_time
+    time = (
+        f"at most {requirement.latest():.2f} s" if requirement.at_most else f"{low:.2f} to {requirement.latest():.2f} s"
+    )
     band = "3.6 deg" if requirement.axis == "yaw" else "2 cm"
     return (
-        f"{time}, overshoot at most {said_of('overshoot', MARGIN * requirement.overshoot, requirement)}, error at most "
-        f"{said_of('error', MARGIN * requirement.error, requirement)} in {trials} trials of {duration:g} s; settled is "
+        f"{time}, overshoot at most {said_of('overshoot', requirement.overshoot, requirement)}, error at most "
+        f"{said_of('error', requirement.error, requirement)} in {trials} trials of {duration:g} s; settled is "
         f"within {band} to the end, a trial that does not settle counts as infinitely slow"
     )
 
@@ -54,13 +55,13 @@ def describe_step(step: Step, before: Measured | None, requirement: Requirement)
         if step.edit.expects is not None:
             note += f", expected {said_of(measure, step.edit.expects, requirement)}"
         notes[measure] = f" ({note})"
-    misses = requirement.misses(step.measured, MARGIN)
-    missing = ", ".join(describe_miss(name, size, requirement, MARGIN) for name, size in misses.items())
+    misses = requirement.misses(step.measured)
+    missing = ", ".join(describe_miss(name, size, requirement) for name, size in misses.items())
     return f"{describe(step.measured, requirement, notes)}; {f'missing: {missing}' if missing else 'met'}"
 
 
-def describe_miss(measure: str, size: float, requirement: Requirement, margin: float = 1.0) -> str:
-    """A miss, as `Requirement.misses` has it with this margin, in words."""
+def describe_miss(measure: str, size: float, requirement: Requirement) -> str:
+    """A miss, as `Requirement.misses` has it, in words."""
     if measure == "settling_time":
         side = "slow" if size > 0 else "fast"
         share = f"{100 * abs(math.expm1(size)):.0f} %" if math.isfinite(size) else "far"
@@ -68,7 +69,7 @@ def describe_miss(measure: str, size: float, requirement: Requirement, margin: f
     if measure in ("settled", "kept"):
         share = said_of(measure, requirement.settled + size, requirement)
         return f"only {share} settle" if measure == "settled" else f"only {share} keep the bounds you have set"
-    return f"{measure} above {said_of(measure, margin * getattr(requirement, measure), requirement)}"
+    return f"{measure} above {said_of(measure, getattr(requirement, measure), requirement)}"
 
 
 def said_of(measure: str, value: float, requirement: Requirement) -> str:
