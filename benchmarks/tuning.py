@@ -5,8 +5,9 @@
 
 Every method begins with the same known policy, trains with the same settings, may train twelve times, looks at the
 same tuning starts, and is judged on the same fresh ones. TPE and random search draw the fields the rules may edit from
-the rules' ranges, in logarithms, each training going on from the known policy; TPE minimises the distance from the
-requirement, and is told how the known policy flies before its first draw; its first four draws are random.
+the rules' ranges, in logarithms, each training going on from the known policy; TPE minimises what the tuner does, the
+distance from what is asked of the tuning starts, and is told how the known policy flies before its first draw; its
+first four draws are random. Settings of the training itself are left as they are; the tuner may train longer.
 
 A training that was made before (the same task, first policy and seed) is taken from the cache that all share; its
 seconds count as if it had been made again. One process per core; one JSON per requirement, method and seed.
@@ -141,7 +142,10 @@ def search(tuner: Any, method: str, seed: int) -> bool:
     from flytune.tune.rules import field_of
 
     optuna.logging.set_verbosity(optuna.logging.WARNING)
-    requirement = tuner.requirement
+
+    def left(step: Any) -> float:
+        return sum(tuner.target.parts(step.measured).values())
+
     ranges = {
         rule.field: tuple(map(float, rule.range))
         for rule in tuner.rules
@@ -152,7 +156,7 @@ def search(tuner: Any, method: str, seed: int) -> bool:
     }
     tuner.begin()
     samplers = {
-        "tpe": optuna.samplers.TPESampler(seed=seed, n_startup_trials=4),
+        "tpe": optuna.samplers.TPESampler(seed=seed, n_startup_trials=5),  # the known policy, and four draws
         "random": optuna.samplers.RandomSampler(seed),
     }
     study = optuna.create_study(sampler=samplers[method])
@@ -163,7 +167,7 @@ def search(tuner: Any, method: str, seed: int) -> bool:
                 name: optuna.distributions.FloatDistribution(low, high, log=True)
                 for name, (low, high) in ranges.items()
             },
-            value=requirement.distance(tuner.steps[0].measured),
+            value=left(tuner.steps[0]),
         )
     )
     while True:
@@ -171,11 +175,13 @@ def search(tuner: Any, method: str, seed: int) -> bool:
         if not tuner.target.misses(step.measured) and not tuner.verdict(step).misses:
             return True
         if len(tuner.steps) > BUDGET:
-            return False
+            nearest = tuner.nearest()
+            unjudged = all(verdict.step != nearest.number for verdict in tuner.verdicts)
+            return unjudged and not tuner.verdict(nearest).misses
         trial = study.ask()
         values = {name: trial.suggest_float(name, low, high, log=True) for name, (low, high) in ranges.items()}
         tuner.train(len(tuner.steps), values, dict.fromkeys(values, method), None, 0)
-        study.tell(trial, requirement.distance(tuner.steps[-1].measured))
+        study.tell(trial, left(tuner.steps[-1]))
 
 
 def summary(folder: Path) -> str:
@@ -201,9 +207,13 @@ def summary(folder: Path) -> str:
         mine = [row for row in chosen if "refused" not in row]
         cells = []
         for name in ("trainings", "seconds"):
-            needed = [float(row[name]) if row["met"] else math.inf for row in mine]
-            low, high = bootstrap_interval([needed])
-            middle = sorted(needed)[(len(needed) - 1) // 2]
+            asked = sorted({row["requirement"] for row in mine})
+            needed = [
+                [float(row[name]) if row["met"] else math.inf for row in mine if row["requirement"] == one]
+                for one in asked
+            ]
+            low, high = bootstrap_interval(needed)  # over requirements, then over the seeds of each
+            middle = sorted(sum(needed, []))[(len(mine) - 1) // 2]
             told = ["never" if end is None or math.isinf(end) else f"{end:.0f}" for end in (middle, low, high)]
             cells.append(f"{told[0]} [{told[1]} to {told[2]}]")
         lines.append(f"| {title} | {sum(row['met'] for row in mine)} of {len(mine)} | {' | '.join(cells)} |")

@@ -69,6 +69,16 @@ def test_every_step_its_reason_and_the_verdict_are_on_the_page(tmp_path):
     assert bands == [pytest.approx((5.4, 6.6)), pytest.approx((0, 5)), pytest.approx((0, 10))]
 
 
+def test_no_overshoot_at_all_still_has_an_axis(tmp_path):
+    tuning = copy.deepcopy(TUNING)
+    tuning["requirement"]["overshoot"] = 0.0
+    for each in tuning["lines"]:
+        each["measured"]["overshoot"] = 0.0
+    write_tuning(tmp_path / "page.html", tuning)
+    layout = Reader((tmp_path / "page.html").read_text()).figures[0]["layout"]
+    assert layout["yaxis2"]["range"][1] > 0
+
+
 def test_what_was_not_met_is_said_with_its_reason(tmp_path):
     write_tuning(tmp_path / "page.html", TUNING | {"met": False, "why": "not met: 9% too slow. no rule can help."})
     assert "Not met: 9% too slow. no rule can help." in Reader((tmp_path / "page.html").read_text()).text

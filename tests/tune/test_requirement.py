@@ -85,6 +85,15 @@ def test_the_tuning_starts_are_asked_for_more_of_everything_but_the_shares():
     assert early.aim() < early.latest()
 
 
+def test_a_miss_is_finite_and_of_the_right_sign_whatever_was_measured():
+    for at_most in (False, True):
+        wanted = make_requirement(3.4, at_most=at_most).narrowed()
+        for time in (0.0, 1.0, wanted.aim(), wanted.latest() + 1e-9, 50.0, math.inf):
+            miss = wanted.misses(but(settling_time=time, error=math.inf, overshoot=math.inf)).get("settling_time")
+            assert miss is None or (math.isfinite(miss) and miss * (time - wanted.aim()) > 0)
+    assert set(make_requirement(2).misses(but(settling_time=0.0))) == {"settling_time"}
+
+
 def test_too_slow_is_positive_and_too_fast_negative():
     wanted = make_requirement(2.0)
     assert wanted.misses(but(settling_time=4.0))["settling_time"] == pytest.approx(math.log(2))

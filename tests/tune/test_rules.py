@@ -40,6 +40,7 @@ def test_a_rule_edits_a_number_of_a_known_task_that_may_be_moved_to_both_ends(ru
         ('name = "a"\nwhen = "too slow"\nfield = "x"\ndirection = "up"\nslope = -1.0\nrange = [3, 2]', "smaller first"),
         ('name = "a"\nwhen = "too slow"\nfield = "x"\ndirection = "up"\nslope = -1.0\nlargest = 1.0', "largest"),
         ('name = "a"\nadvise = "b"', "advise: no such field"),
+        ('name = "a"\nadvice = """b\nc"""', "holds a line break"),
     ],
 )
 def test_a_rule_that_makes_no_sense_is_refused_with_its_number(tmp_path, rule, said):

@@ -13,7 +13,7 @@ from flytune.response.fly import fly
 from flytune.response.judge import judge
 from flytune.task.task import load_task
 from flytune.tune.requirement import make_requirement
-from flytune.tune.rules import load_rules
+from flytune.tune.rules import Rule, load_rules
 from flytune.tune.search import tune
 
 RULES = load_rules()
@@ -83,6 +83,62 @@ def test_starts_of_a_verdict_that_disappoints_become_tuning_starts_and_a_resumed
     again = tune(wanted, RULES, tmp_path / "t", task="baseline-refined", edits=fixed, most_steps=1, resume=True)
     assert [step.measured for step in again.steps] == [step.measured for step in result.steps]
     assert [verdict.seed for verdict in again.verdicts] == [verdict.seed for verdict in result.verdicts]
+
+
+def test_a_training_that_diverges_is_a_step_that_is_not_gone_on_from(tmp_path):
+    # a gradient of 5e18 has a finite square in float32, nine times as much has not
+    (tmp_path / "stiff.toml").write_text('based_on = "baseline"\n[reward.smoothness]\nweight = 3e20\n')
+    rule = Rule(
+        name="stiffer", when="unsettled", field="reward.smoothness.weight", direction="up", slope=0.1, largest=9.0,
+        range=(1e-4, 1e25), says="it is stiffer", source="test",
+    )  # fmt: skip
+    said = []
+    arguments = {"task": str(tmp_path / "stiff.toml"), "edits": {"apg.updates": 2}, "most_steps": 3}
+    result = tune(make_requirement(2.0), [rule], tmp_path / "t", tell=said.append, **arguments)
+    assert [bool(step.diverged) for step in result.steps] == [False, True]
+    assert any(line.startswith("step 1   diverged: training: ") for line in said)
+    assert result.best == 0
+    again = tune(make_requirement(2.0), [rule], tmp_path / "t", resume=True, **arguments)
+    assert (again.steps, again.verdicts) == (result.steps, result.verdicts)
+
+
+def test_what_has_ended_without_success_stays_as_it_is_when_resumed(tmp_path):
+    rules = [rule for rule in RULES if rule.name == "H6 faster"]
+    fixed = {"apg.updates": 1}
+    first = tune(make_requirement(2.0), rules, tmp_path / "t", edits=fixed, most_steps=2)
+    assert not first.met
+    again = tune(make_requirement(2.0), rules, tmp_path / "t", edits=fixed, most_steps=2, resume=True)
+    assert (again.steps, again.verdicts, again.best) == (first.steps, first.verdicts, first.best)
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"seed": -1}, r"seed: -1 is not allowed"),
+        ({"edits": {"termination.speed": {"kind": "maximum_speed", "bound": 0.8}}}, "the speed bound of 0.8 m/s you"),
+        ({"trainer": "sb3"}, "trainer: 'sb3' is not allowed"),
+        ({"task": "n" * 300}, "is no preset"),
+    ],
+)
+def test_what_cannot_be_tuned_is_refused_before_anything_is_written(tmp_path, changes, said):
+    with pytest.raises(BadInput, match=said):
+        tune(make_requirement(1.0), RULES, tmp_path / "t", **changes)
+    assert not (tmp_path / "t").exists()
+
+
+def test_a_rule_that_could_move_its_field_where_it_may_not_be_is_refused(tmp_path):
+    rule = Rule(
+        name="mine", when="too slow", field="reward.horizontal.share", direction="up", slope=-0.1, range=(0.1, 1.5)
+    )
+    with pytest.raises(BadInput, match=r"rules: mine: range: reward\.horizontal\.share: 1\.5 is not allowed"):
+        tune(make_requirement(2.0), [rule], tmp_path / "t")
+
+
+def test_a_directory_that_cannot_be_written_is_one_line(tmp_path):
+    (tmp_path / "file").write_text("")
+    for out in (tmp_path / "file" / "t", tmp_path / ("n" * 300)):
+        with pytest.raises(BadInput, match="cannot be written"):
+            tune(make_requirement(3.0), RULES, out, task="baseline-refined")
 
 
 @pytest.mark.slow

@@ -36,8 +36,13 @@ def test_a_field_that_no_known_task_has_is_refused():
 
 def test_a_task_nobody_flies_is_to_be_learned_from_nothing():
     start = find_start(make_requirement(3), "baseline", {}, "apg")
-    assert (start.name, start.policy, start.files) == ("baseline", None, None)
-    assert start.task.apg.updates == 300
+    assert (start.name, start.files) == ("baseline", None)
+    # learned with the task's own settings, gone on from with the tuner's
+    assert (start.first.apg.updates, start.task.apg.updates) == (300, 200)
+
+
+def test_a_known_policy_with_other_layers_than_the_user_wants_is_not_gone_on_from():
+    assert find_start(make_requirement(3), "baseline-refined", {"apg.hidden": [32, 32]}, "apg").files is None
 
 
 def test_ppo_begins_with_a_policy_of_its_own():

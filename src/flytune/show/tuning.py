@@ -81,7 +81,7 @@ def response_per_step(tuning: Mapping[str, Any]) -> go.Figure:
         )  # fmt: skip
         # after the trace: plotly leaves an empty panel without it
         figure.add_hrect(y0=low, y1=high, fillcolor=style.BAND, line_width=0, row=1, col=column)  # pyright: ignore
-        top = max([value for value in values if value is not None] + [high])
+        top = max([value for value in values if value is not None] + [high]) or 1.0
         figure.update_yaxes(range=[0, 1.1 * top], row=1, col=column)
     figure.update_xaxes(title_text="step", dtick=1 if len(numbers) < 15 else None)
     return style.frame(figure, 360, margin={"l": 50, "r": 14, "t": 64, "b": 48})

@@ -14,6 +14,7 @@ from flytune.tune.step import HALF_WAY, Edit, Step
 
 TRUST = {"between": 1.0, "flown": 1.0, "map": 0.9, "rule": 0.6}  # in a slope, by where it comes from
 EFFORT = 0.1  # what a factor of e costs: of two edits that promise the same, the smaller
+SMALLEST = 0.002  # share of its value that an edit changes a field by, at least
 SAME = 0.01  # two values of a field nearer than this share are the same
 FEEBLE = 0.25  # a slope less than this share of the effect map's, flown elsewhere, does not count
 HARM = 0.5  # what it costs to push another measure over its bound
@@ -64,7 +65,7 @@ def choose(
     nearest = min(steps, key=lambda step: (_left(case, step), -step.number))
     options: list[tuple[float, int, Edit]] = []
     refused: dict[str, list[str]] = {}
-    for step in steps:
+    for step in (step for step in steps if not step.diverged):
         found, why_not = _options(case, step)
         options += [(left, -step.number, edit) for left, edit in found]
         refused = why_not if step is nearest else refused
@@ -150,14 +151,17 @@ def _edit(case: _Case, rule: Rule, step: Step) -> Edit | str:
     if rule.measure in ("settled", "kept") or not math.isfinite(now):
         after, gain, expects = moved(rule, value, float(rule.largest) ** up), 0.5, None
     else:
+        # a miss is never nothing: the aim lies within what is allowed
         wanted = math.log(_aim(rule.measure, case.requirement) / max(now, 1e-9))
         slope = _interpolated(case, rule, step, value, wanted, slope)
         after = moved(rule, value, math.exp(max(-3.0, min(3.0, wanted / slope.power))))
         promised = slope.power * math.log(after / value)
-        gain = min(1.0, promised / wanted) if wanted else 0.0
+        gain = min(1.0, promised / wanted)
         expects = now * math.exp(promised)
-    if (after - value) * up <= 0 or abs(after / value - 1) < 0.002:
+    if value == rule.range[up > 0]:
         return f"{rule.field} is at {value:g}, the end of its range"
+    if (after - value) * up <= 0 or abs(after / value - 1) < SMALLEST:
+        return "the steps on both sides leave nothing to change"
     if (twin := _twin(case, step, rule.field, after)) is not None:
         return f"{rule.field} {after:g} was flown in step {twin.number}"
     return Edit(
@@ -181,7 +185,7 @@ def _aim(measure: str, requirement: Requirement) -> float:
     """Where to steer a measure to: the settling time itself, half of what is allowed for the others."""
     if measure == "settling_time":
         return requirement.aim()
-    return 0.5 * max(getattr(requirement, measure), 1e-3)
+    return 0.5 * (max(requirement.overshoot, 1e-3) if measure == "overshoot" else requirement.error)
 
 
 def _alike(first: Step, second: Step, field: str) -> bool:

@@ -12,6 +12,7 @@ from flytune.response.statistics import quantile
 from flytune.task.task import Task
 from flytune.task.termination import MaximumBodyRate, MaximumSpeed
 from flytune.tune.requirement import Requirement
+from flytune.tune.rules import is_fixed
 
 Times = Float[np.ndarray, "N"]
 
@@ -50,7 +51,7 @@ def check_possible(task: Task, requirement: Requirement, flights: Flights, fixed
     if axis == "yaw":
         angle = _yaw_errors(flights)
         for name, end in task.termination.items():
-            if isinstance(end, MaximumBodyRate) and f"termination.{name}.bound_deg_per_s" in fixed:
+            if isinstance(end, MaximumBodyRate) and is_fixed(f"termination.{name}.bound_deg_per_s", fixed):
                 rate = math.radians(float(end.bound_deg_per_s))
                 _refuse(requirement, np.maximum(0.0, angle - YAW_BAND) / rate, share, wanted,
                         f"the body rate bound of {float(end.bound_deg_per_s):g} deg/s you have set")  # fmt: skip
@@ -58,7 +59,7 @@ def check_possible(task: Task, requirement: Requirement, flights: Flights, fixed
     way = np.asarray(flights.target_position - flights.position[:, 0], dtype=np.float64)
     distance = np.linalg.norm(way, axis=1) if axis == "position" else np.abs(way[:, "xyz".index(axis)])
     for name, end in task.termination.items():
-        if isinstance(end, MaximumSpeed) and f"termination.{name}.bound" in fixed:
+        if isinstance(end, MaximumSpeed) and is_fixed(f"termination.{name}.bound", fixed):
             _refuse(requirement, np.maximum(0.0, distance - POSITION_BAND) / float(end.bound), share, wanted,
                     f"the speed bound of {float(end.bound):g} m/s you have set", distance)  # fmt: skip
     gravity = float(task.vehicle.gravity)

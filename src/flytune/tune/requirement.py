@@ -13,6 +13,7 @@ from flytune.response.statistics import quantile
 
 AXES = ("position", "x", "y", "z", "yaw")
 LONGEST = 60.0  # s
+FAR = 20.0  # the largest miss there is, also where the measure is infinite
 TUNING_TOLERANCE, TUNING_BOUNDS = 0.5, 0.8  # shares of what is allowed on fresh starts that the tuning starts may take
 
 
@@ -95,7 +96,7 @@ class Requirement:
     def misses(self, measured: Measured) -> dict[str, float]:
         """What is missing: measure -> by how much, as a logarithm for the settling time and a share for the others.
 
-        Positive means too much, negative too little. Empty where the requirement is met.
+        Positive means too much, negative too little; at most `FAR`. Empty where the requirement is met.
         """
         found: dict[str, float] = {}
         if measured.settled < self.settled:
@@ -104,11 +105,11 @@ class Requirement:
             found["kept"] = measured.kept - self.settled
         ratio = measured.settling_time / self.settling_time
         if measured.settling_time > self.latest() or (not self.at_most and ratio < 1 - self.tolerance):
-            found["settling_time"] = math.log(measured.settling_time / self.aim())
+            found["settling_time"] = _log(measured.settling_time / self.aim())
         if measured.overshoot > self.overshoot:
-            found["overshoot"] = measured.overshoot - self.overshoot
+            found["overshoot"] = min(measured.overshoot - self.overshoot, FAR)
         if measured.error > self.error:
-            found["error"] = math.log(measured.error / self.error)
+            found["error"] = _log(measured.error / self.error)
         return found
 
     def parts(self, measured: Measured) -> dict[str, float]:
@@ -179,10 +180,13 @@ def make_requirement(
         error = 1.0 if axis == "yaw" else 0.01
     millimetres = axis != "yaw" and 1 <= error <= 20
     hint = f" Did you mean {error / 1000:g} (metres, not millimetres)?" if millimetres else ""
-    hint = hint or f" Beyond {largest:g} {unit} a trial does not count as settled."
+    if error > largest:
+        hint = hint or f" Beyond {largest:g} {unit} a trial does not count as settled."
     _check("error", error, smallest, largest, unit, hint)
     _check("tolerance", tolerance, 2.0, 50.0, "%", f" Did you mean {100 * tolerance:g}?" if 0 < tolerance < 1 else "")
-    _check("percentile", percentile, 1.0, 99.0, "%", f" Did you mean {100 * percentile:g}?" if percentile < 1 else "")
+    _check(
+        "percentile", percentile, 1.0, 99.0, "%", f" Did you mean {100 * percentile:g}?" if 0 < percentile < 1 else ""
+    )
     return Requirement(
         settling_time=float(settling_time),
         tolerance=tolerance / 100,
@@ -192,6 +196,10 @@ def make_requirement(
         axis=axis,
         percentile=float(percentile),
     )
+
+
+def _log(ratio: float) -> float:
+    return FAR if math.isinf(ratio) else max(-FAR, min(FAR, math.log(max(ratio, 1e-6))))
 
 
 def _quantile(values: np.ndarray, share: float) -> float:

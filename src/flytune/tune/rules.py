@@ -46,6 +46,8 @@ class Rule:
 
     def problem(self) -> str | None:
         """What makes the rule impossible, or None."""
+        if any("\n" in text for text in (self.name, self.says, self.source, self.advice)):
+            return "says: holds a line break. Allowed: one line, as for name, source and advice."
         if self.advice:
             return None
         for name in ("when", "field", "direction"):
@@ -108,6 +110,14 @@ def field_of(task: dict[str, Any], path: str) -> float | None:
     for part in path.split("."):
         node = node.get(part) if isinstance(node, dict) else None
     return float(node) if isinstance(node, int | float) and not isinstance(node, bool) else None
+
+
+def is_whole(task: dict[str, Any], path: str) -> bool:
+    """Whether the number at a field path of a task's tables is a whole one, and has to stay so."""
+    node: Any = task
+    for part in path.split("."):
+        node = node.get(part) if isinstance(node, dict) else None
+    return isinstance(node, int) and not isinstance(node, bool)
 
 
 def is_fixed(path: str, fixed: Sequence[str]) -> bool:

@@ -2,6 +2,8 @@
 
 import dataclasses
 import json
+import math
+import os
 import shutil
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -10,15 +12,15 @@ from typing import Any
 
 from flytune import document
 from flytune.control.policy import Policy, load_policy
-from flytune.errors import BadInput, Interrupted
-from flytune.learn.directory import write_text
+from flytune.errors import BadInput, Diverged, Interrupted
+from flytune.learn.directory import first_difference, write_text
 from flytune.learn.run import Progress, train
-from flytune.task.task import Task, load_task, preset_names, write_task
+from flytune.task.task import Task, load_task, write_task
 from flytune.tune.choose import choose
 from flytune.tune.effects import load_effects
 from flytune.tune.requirement import Measured, Requirement
 from flytune.tune.result import Tuning, Verdict
-from flytune.tune.rules import Rule
+from flytune.tune.rules import Rule, field_of, is_whole
 from flytune.tune.start import TUNING_SEED, TUNING_TRIALS, edited, find_start, fly_for, tuning_duration
 from flytune.tune.step import Edit, Step
 from flytune.tune.words import describe, describe_edit, describe_miss, describe_step, describe_targets, said_of
@@ -26,6 +28,7 @@ from flytune.tune.words import describe, describe_edit, describe_miss, describe_
 FRESH_SEED, FRESH_TRIALS = 4000, 200  # the starts of a verdict; each verdict has its own
 MOST_STEPS = 12
 MOST_VERDICTS = 3  # on one step
+LOST = Measured(settling_time=math.inf, overshoot=math.inf, error=math.inf, settled=0.0, kept=0.0)
 
 Tell = Callable[[str], None]
 
@@ -65,11 +68,16 @@ class Tuner:
         self.verdicts: list[Verdict] = []
         self.start = find_start(requirement, task, self.edits, trainer)
         self.tables = document.plain(self.start.task)
+        self.asked["tables"] = {name: table for name, table in self.tables.items() if name != "sources"}
         self.bounds = tuple(
             name
             for name in self.start.task.termination
-            if any(path.startswith(f"termination.{name}.") for path in edits)
+            if any(f"{path}.".startswith(f"termination.{name}.") or path == "termination" for path in edits)
         )
+        for rule in rules:
+            if rule.field and field_of(self.tables, rule.field) is not None:
+                for end in rule.range:
+                    self._check(rule, end)
 
     # the loop
 
@@ -93,24 +101,39 @@ class Tuner:
             if ready := [step for step in self.steps if self._is_ready(step)]:
                 self.verdict(ready[-1])
                 continue
-            if len(self.steps) > self.most_steps:
-                blocked = [f"{self.most_steps} edits were made, as many as are allowed"]
-                break
-            chosen = choose(self.steps, self.tables, self.target, self.rules, self.effects, self.fixed,
-                            trainer=self.trainer)  # fmt: skip
-            if isinstance(chosen, list):
-                blocked = chosen
-                break
-            self._take(*chosen)
-        best = min(self.steps, key=lambda step: (self.requirement.distance(step.measured), step.number))
-        if all(verdict.step != best.number for verdict in self.verdicts):
+            chosen = [f"{self.most_steps} edits were made, as many as are allowed"]
+            if len(self.steps) <= self.most_steps:
+                chosen = choose(self.steps, self.tables, self.target, self.rules, self.effects, self.fixed,
+                                trainer=self.trainer)  # fmt: skip
+            if not isinstance(chosen, list):
+                self._take(*chosen)
+                continue
+            best = self.nearest()
+            if any(verdict.step == best.number for verdict in self.verdicts):
+                return self._end(best.number, chosen)
             self.verdict(best)
-        return self._end(best.number, blocked)
+
+    def nearest(self) -> Step:
+        """The step that is nearest to the requirement; of those that meet it, one that was not judged yet."""
+        judged = {verdict.step for verdict in self.verdicts}
+
+        def order(step: Step) -> tuple[float, bool, float, int]:
+            far, left = self.requirement.distance(step.measured), sum(self.target.parts(step.measured).values())
+            return far, step.number in judged, left, step.number
+
+        return min((step for step in self.steps if not step.diverged), key=order)
+
+    def _check(self, rule: Rule, value: float) -> None:
+        """Refuse a rule that could move its field to a value the task cannot have."""
+        try:
+            self.task_of(len(self.steps) + 1, {rule.field: value}, {rule.field: rule.name})
+        except BadInput as error:
+            raise BadInput(f"rules: {rule.name}: range: {error}") from None
 
     def _is_ready(self, step: Step) -> bool:
         """Whether a step meets the requirement on all tuning starts, and was not judged too often."""
         judged = sum(verdict.step == step.number for verdict in self.verdicts)
-        return judged < MOST_VERDICTS and not self.target.misses(step.measured)
+        return not step.diverged and judged < MOST_VERDICTS and not self.target.misses(step.measured)
 
     def _starts(self) -> list[tuple[int, int]]:
         """Seed and number of every set of tuning starts: those of a verdict that disappointed have become some."""
@@ -127,10 +150,10 @@ class Tuner:
         """Every step measured on all the tuning starts there are."""
         starts = self._starts()
         for index, step in enumerate(self.steps):
-            if step.looks == len(starts):
+            if step.looks == len(starts) or step.diverged:
                 continue
             policy = load_policy(self._folder(step.number) / "policy.safetensors")
-            measured = self._measure(policy, self.task_of(step.values, step.reasons))
+            measured = self._measure(policy, self.task_of(step.number, step.values, step.reasons))
             self.steps[index] = dataclasses.replace(step, measured=measured, looks=len(starts))
             if step.number == self.verdicts[-1].step:
                 trials = sum(number for _, number in starts)
@@ -172,21 +195,30 @@ class Tuner:
         self, number: int, values: dict[str, float], reasons: dict[str, str], edit: Edit | None, origin: int | None
     ) -> None:
         """One more step: the start's task with these values, trained on from step `origin`, and flown."""
-        task = self.task_of(values, reasons)
+        task = self.task_of(number, values, reasons)
         initial = None
         if self.trainer == "apg" and origin is not None:
             initial = load_policy(self._folder(origin) / "policy.safetensors")
-        policy, seconds = self.learn(task, initial, self._folder(number))
+        diverged, seconds = "", 0.0
+        try:
+            policy, seconds = self.learn(task, initial, self._folder(number))
+            measured = self._measure(policy, task)
+        except Diverged as error:
+            if origin is None:
+                raise
+            diverged, measured = str(error), LOST
         self._keep(
             Step(
-                number=number, values=values, reasons=reasons, edit=edit, origin=origin,
-                measured=self._measure(policy, task), looks=len(self._starts()), seconds=seconds,
+                number=number, values=values, reasons=reasons, edit=edit, origin=origin, measured=measured,
+                looks=len(self._starts()), seconds=seconds, diverged=diverged,
             )
         )  # fmt: skip
 
     def learn(self, task: Task, initial: Policy | None, folder: Path) -> tuple[Policy, float]:
         """The policy of a task, trained into `folder` or gone on with there, and the seconds it took."""
         resumable = (folder / "checkpoint" / "learner.safetensors").exists()
+        if resumable:  # of another version of flytune, perhaps, which chose another edit
+            resumable = first_difference(document.plain(load_task(folder / "task.toml")), document.plain(task)) is None
         if folder.exists() and not resumable:
             shutil.rmtree(folder)
         run = train(
@@ -195,10 +227,14 @@ class Tuner:
         )  # fmt: skip
         return run.policy, run.metrics[-1]["seconds"]
 
-    def task_of(self, values: Mapping[str, float], reasons: Mapping[str, str]) -> Task:
-        """The start's task with these edits."""
-        whole = {"apg.updates", "ppo.steps"}
-        changes = {path: (round(value) if path in whole else value, reasons[path]) for path, value in values.items()}
+    def task_of(self, number: int, values: Mapping[str, float], reasons: Mapping[str, str]) -> Task:
+        """The task of step `number`: the start's with these edits."""
+        if number == 0 and self.start.files is None:
+            return self.start.first
+        changes = {
+            path: (round(value) if is_whole(self.tables, path) else value, reasons[path])
+            for path, value in values.items()
+        }
         return edited(self.start.task, changes)
 
     def _keep(self, step: Step) -> None:
@@ -214,7 +250,7 @@ class Tuner:
         """The step on starts of its own."""
         seed = FRESH_SEED + len(self.verdicts)
         policy = load_policy(self._folder(step.number) / "policy.safetensors")
-        task = self.task_of(step.values, step.reasons)
+        task = self.task_of(step.number, step.values, step.reasons)
         judgement = fly_for(self.requirement, policy, task, seed, FRESH_TRIALS)
         measured = self.requirement.measure(judgement, fixed=self.bounds)
         verdict = Verdict(
@@ -233,7 +269,7 @@ class Tuner:
         for name in ("policy.safetensors", "policy-last.safetensors", "metrics.jsonl", "run.json"):
             if (folder / name).exists():
                 shutil.copyfile(folder / name, self.out / name)
-        write_text(self.out / "task.toml", write_task(self.task_of(step.values, step.reasons)))
+        write_text(self.out / "task.toml", write_task(self.task_of(step.number, step.values, step.reasons)))
         told = next((v.judgement for v in reversed(self.verdicts) if v.step == best), None)
         if told is not None:
             write_text(self.out / "evaluation.json", json.dumps(told, indent=2) + "\n")
@@ -255,8 +291,11 @@ class Tuner:
             "steps": [step.to_dict() for step in self.steps],
             "verdicts": [dataclasses.asdict(verdict) for verdict in self.verdicts], **(ended or {}),
         }  # fmt: skip
-        self.out.mkdir(parents=True, exist_ok=True)
-        write_text(self.out / "tune.json", json.dumps(told, indent=2) + "\n")
+        try:
+            self.out.mkdir(parents=True, exist_ok=True)
+            write_text(self.out / "tune.json", json.dumps(told, indent=2) + "\n")
+        except OSError as error:
+            raise BadInput(f"out: {self.out} cannot be written ({error.strerror}). Give another directory.") from None
 
     def resume(self) -> None:
         """Take up the steps that `tune.json` holds.
@@ -272,12 +311,13 @@ class Tuner:
             asked = {name: told[name] for name in self.asked}
         except OSError:
             raise BadInput(f"resume: {self.out} holds no tuning. Leave out --resume to start one.") from None
-        except (ValueError, KeyError, TypeError) as error:
+        except (ValueError, KeyError, TypeError, AttributeError) as error:
             raise BadInput(f"resume: {path} is damaged ({error}). Tune again into another directory.") from None
         now = json.loads(json.dumps(self.asked))
-        if changed := [name for name in now if now[name] != asked[name]]:
+        changed = ["task" if name == "tables" else name for name in now if now[name] != asked[name]]
+        if changed:
             raise BadInput(
-                f"resume: {self.out} was asked for another {', '.join(changed)}. Give the same, or another directory."
+                f"resume: {self.out} was asked for another {changed[0]}. Give the same, or another directory."
             )
         self.steps, self.verdicts = steps, verdicts
 
@@ -329,11 +369,11 @@ def tune(
         raise BadInput(f"trainer: {trainer!r} is not allowed. Allowed: apg, ppo.")
     if not 1 <= most_steps <= 100:
         raise BadInput(f"steps: {most_steps} is not allowed. Allowed: a whole number, 1 to 100.")
-    if task is not None and task not in preset_names() and not Path(task).is_file():
-        load_task(task)  # says what is allowed
-    if out.exists() and not out.is_dir():
+    if not 0 <= seed < 2**32:
+        raise BadInput(f"seed: {seed} is not allowed. Allowed: a whole number, 0 to {2**32 - 1}.")
+    if os.path.exists(out) and not os.path.isdir(out):
         raise BadInput(f"out: {out} is a file. Give a directory that does not exist yet.")
-    if not resume and any((out / name).exists() for name in ("tune.json", "run.json")):
+    if not resume and any(os.path.exists(out / name) for name in ("tune.json", "run.json", "steps")):
         raise BadInput(f"out: {out} already holds a tuning or a run. Give another directory, or --resume.")
     begun = time.monotonic()
     tuner = Tuner(

@@ -29,9 +29,9 @@ class Start:
     """The task a tuning begins with, and the policy that flies it."""
 
     name: str
-    task: Task  # with the user's fields, prepared for a tuning
-    policy: Policy | None  # None where the task has to be learned from nothing
-    files: tuple[Path, Path] | None  # of the policy, and run.json of its training
+    task: Task  # with the user's fields, prepared for trainings that go on from a policy
+    first: Task  # the same, prepared for a training from nothing
+    files: tuple[Path, Path] | None  # of the policy, and run.json of its training; None where it has to be learned
     judgement: Judgement | None  # of the policy on the tuning starts
     times: Mapping[str, float]  # known task -> settling time in s of its policy under the user's fields
 
@@ -58,7 +58,7 @@ def find_start(requirement: Requirement, wanted: str | None, edits: Mapping[str,
     nobody = classical_pilot("lqr", load_task("baseline"), "tuned")  # its flights are for their starts alone
     flights = fly(nobody, first, trials=TUNING_TRIALS, seed=TUNING_SEED, duration=0.6)
     check_possible(first, requirement, flights, tuple(edits))
-    files = {name: found for name in tasks if (found := _shipped(name, trainer)) is not None}
+    files = {name: found for name, task in tasks.items() if (found := _shipped(name, task, trainer)) is not None}
     policies = {name: load_policy(found[0]) for name, found in files.items()}
     flown = {
         name: fly_for(requirement, policy, tasks[name], TUNING_SEED, TUNING_TRIALS) for name, policy in policies.items()
@@ -69,12 +69,11 @@ def find_start(requirement: Requirement, wanted: str | None, edits: Mapping[str,
     usable = [name for name in near if math.isfinite(near[name])]
     otherwise = WHERE_NOTHING_FLIES if WHERE_NOTHING_FLIES in tasks else next(iter(tasks))
     name = min(usable, key=near.__getitem__) if usable else otherwise
-    policy = policies[name] if usable else None
     task = dataclasses.replace(tasks[name], name=f"{tasks[name].name}-tuned-{requirement.settling_time:g}s")
     return Start(
         name=name,
-        task=_prepared(task, requirement, trainer, policy is not None, tuple(edits)),
-        policy=policy,
+        task=_prepared(task, requirement, trainer, True, tuple(edits)),
+        first=_prepared(task, requirement, trainer, False, tuple(edits)),
         files=files[name] if usable else None,
         judgement=flown[name] if usable else None,
         times=times,
@@ -95,8 +94,8 @@ def edited(task: Task, changes: Mapping[str, tuple[Any, str]]) -> Task:
     return document.read(Task, tables)
 
 
-def _prepared(task: Task, requirement: Requirement, trainer: str, flies: bool, fixed: tuple[str, ...]) -> Task:
-    """The task with episodes as long as the response asked for, and a trainer that goes on from a policy.
+def _prepared(task: Task, requirement: Requirement, trainer: str, goes_on: bool, fixed: tuple[str, ...]) -> Task:
+    """The task with episodes as long as the response asked for, and a trainer that goes on from a policy or not.
 
     Episodes are made longer by doubling, so that trainings for requirements nearly alike are the same trainings.
     """
@@ -112,7 +111,7 @@ def _prepared(task: Task, requirement: Requirement, trainer: str, flies: bool, f
         wanted["apg.leeway"] = (max(0.5, float(task.apg.leeway)), "tuned: as the refined presets")
         if requirement.settling_time >= SLOW:
             wanted["apg.window"] = (max(500, task.apg.window), "tuned: a slow response is seen whole")
-        if flies:
+        if goes_on:
             wanted["apg.updates"] = (200, "tuned: it goes on from a policy that flies")
             wanted["apg.learning_rate"] = (0.002, "tuned: it goes on from a policy that flies")
     return edited(task, {path: what for path, what in wanted.items() if not is_fixed(path, fixed)})
@@ -132,6 +131,9 @@ def _known_tasks(edits: Mapping[str, Any]) -> dict[str, Task]:
     return found
 
 
-def _shipped(name: str, trainer: str) -> tuple[Path, Path] | None:
+def _shipped(name: str, task: Task, trainer: str) -> tuple[Path, Path] | None:
+    """The policy that ships for a known task, unless the user wants layers it does not have."""
+    if name not in KNOWN or (trainer == DEFAULT_TRAINER and task.apg.hidden != load_task(name).apg.hidden):
+        return None
     known = name if trainer == DEFAULT_TRAINER else f"{name}@{trainer}"
     return shipped_files(known) if known in shipped_names() else None

@@ -47,6 +47,7 @@ class Step:
     measured: Measured
     looks: int  # sets of starts it was measured on
     seconds: float  # of training
+    diverged: str = ""  # what became infinite where; such a step has no policy
 
     def to_dict(self) -> dict[str, Any]:
         """Plain values."""

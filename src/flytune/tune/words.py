@@ -2,7 +2,7 @@
 
 import math
 
-from flytune.tune.requirement import Measured, Requirement
+from flytune.tune.requirement import FAR, Measured, Requirement
 from flytune.tune.step import HALF_WAY, Edit, Step
 
 
@@ -48,6 +48,8 @@ def describe_edit(edit: Edit, requirement: Requirement) -> str:
 
 def describe_step(step: Step, before: Measured | None, requirement: Requirement) -> str:
     """What a step's response is beside what it was and what was expected of its edit, and what is missing."""
+    if step.diverged:
+        return f"diverged: {step.diverged}"
     notes = {}
     if step.edit is not None and before is not None:
         measure = step.edit.measure
@@ -63,9 +65,10 @@ def describe_step(step: Step, before: Measured | None, requirement: Requirement)
 def describe_miss(measure: str, size: float, requirement: Requirement) -> str:
     """A miss, as `Requirement.misses` has it, in words."""
     if measure == "settling_time":
-        side = "slow" if size > 0 else "fast"
-        share = f"{100 * abs(math.expm1(size)):.0f} %" if math.isfinite(size) else "far"
-        return f"{share} too {side} for {requirement.aim():g} s"
+        side, for_what = ("slow" if size > 0 else "fast"), f"{requirement.settling_time:g} s"
+        ratio = requirement.aim() * math.exp(size) / requirement.settling_time
+        share = f"{100 * abs(ratio - 1):.0f} %" if abs(size) < FAR else "far"
+        return f"{share} too {side} for {'at most ' if requirement.at_most else ''}{for_what}"
     if measure in ("settled", "kept"):
         share = said_of(measure, requirement.settled + size, requirement)
         return f"only {share} settle" if measure == "settled" else f"only {share} keep the bounds you have set"
@@ -75,7 +78,7 @@ def describe_miss(measure: str, size: float, requirement: Requirement) -> str:
 def said_of(measure: str, value: float, requirement: Requirement) -> str:
     """A number of a measure with its unit."""
     if not math.isfinite(value):
-        return "never"
+        return "never" if measure == "settling_time" else "infinite"
     if measure == "settling_time":
         return f"{value:.2f} s"
     if measure == "error":
