@@ -213,7 +213,7 @@ def summary(folder: Path) -> str:
                 for one in asked
             ]
             low, high = bootstrap_interval(needed)  # over requirements, then over the seeds of each
-            middle = sorted(sum(needed, []))[(len(mine) - 1) // 2]
+            middle = np.sort(np.concatenate(needed))[(len(mine) - 1) // 2]
             told = ["never" if end is None or math.isinf(end) else f"{end:.0f}" for end in (middle, low, high)]
             cells.append(f"{told[0]} [{told[1]} to {told[2]}]")
         lines.append(f"| {title} | {sum(row['met'] for row in mine)} of {len(mine)} | {' | '.join(cells)} |")
