@@ -83,3 +83,12 @@ def test_a_field_is_fixed_where_it_or_a_table_above_it_was_set():
     assert is_fixed("apg.updates", ("apg.updates",))
     assert is_fixed("termination.speed.bound", ("reward", "termination.speed"))
     assert not is_fixed("termination.speed.bound", ("termination.spee", "reward.velocity.weight"))
+
+
+def test_the_table_says_of_every_rule_when_what_how_far_and_unless():
+    lines = rules_table(RULES).splitlines()
+    line = next(line for line in lines if line.startswith("H6 faster"))
+    for words in ("too slow", "reward.velocity.weight down", "x 2", "0.01 to 1", "settling time ~ field^0.15",
+                  "overshoot missed", "makes haste cost less (paper H6)"):  # fmt: skip
+        assert words in line
+    assert next(line for line in lines if line.startswith("H10 split: ")).endswith("(paper H10)")

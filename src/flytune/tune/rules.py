@@ -135,19 +135,28 @@ def moved(rule: Rule, value: float, factor: float) -> float:
 
 
 def rules_table(rules: Sequence[Rule]) -> str:
-    """The rules as a table for a terminal."""
-    rows = [("rule", "when", "edit", "range", "because", "source")]
-    for rule in rules:
-        if rule.advice:
-            rows.append((rule.name, "-", "-", "-", rule.advice, rule.source))
-            continue
-        low, high = map(float, rule.range)
-        rows.append(
-            (rule.name, rule.when, f"{rule.field} {rule.direction}", f"{low:g} to {high:g}", rule.says, rule.source)
-        )
-    widths = [max(len(row[column]) for row in rows if not (column == 4 and row[1] == "-")) for column in range(6)]
+    """The rules as a table for a terminal, and below it the advice that is no single number's edit."""
+    rows = [
+        ("rule", "when", "edit", "step at most", "within", "expects, where nothing was measured", "not while", "because")
+    ]
+    rows += [_row(rule) for rule in rules if not rule.advice]
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     lines = ["  ".join(text.ljust(width) for text, width in zip(row, widths, strict=True)).rstrip() for row in rows]
-    return "\n".join([lines[0], "-" * max(map(len, lines[:1])), *lines[1:]])
+    advice = [f"{rule.name}: {rule.advice} ({rule.source})" for rule in rules if rule.advice]
+    return "\n".join([lines[0], "-" * len(lines[0]), *lines[1:], *(["", "Advice:"] if advice else []), *advice])
+
+
+def _row(rule: Rule) -> tuple[str, ...]:
+    low, high = map(float, rule.range)
+    measure = rule.measure.replace("_", " ")
+    expects = f"{measure} ~ field^{rule.slope:g}"
+    if rule.measure in ("settled", "kept"):
+        expects = "more trials settle" if rule.measure == "settled" else "fewer trials cross a bound"
+    guard = ", ".join(rule.spares).replace("_", " ")
+    return (
+        rule.name, rule.when, f"{rule.field} {rule.direction}", f"x {rule.largest:g}", f"{low:g} to {high:g}",
+        expects, f"{guard} missed" if guard else "", f"{rule.says} ({rule.source})",
+    )  # fmt: skip
 
 
 def to_dicts(rules: Sequence[Rule]) -> list[dict[str, Any]]:
