@@ -136,9 +136,7 @@ def moved(rule: Rule, value: float, factor: float) -> float:
 
 def rules_table(rules: Sequence[Rule]) -> str:
     """The rules as a table for a terminal, and below it the advice that is no single number's edit."""
-    rows = [
-        ("rule", "when", "edit", "step at most", "within", "expects, where nothing was measured", "not while", "because")
-    ]
+    rows = [("rule", "when", "edit", "step at most", "within", "expects, if unmeasured", "not while", "because")]
     rows += [_row(rule) for rule in rules if not rule.advice]
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     lines = ["  ".join(text.ljust(width) for text, width in zip(row, widths, strict=True)).rstrip() for row in rows]
