@@ -18,6 +18,7 @@ from flytune.learn.run import Progress, train
 from flytune.task.task import Task, load_task, write_task
 from flytune.tune.choose import choose
 from flytune.tune.effects import load_effects
+from flytune.tune.journal import read_journal, write_journal
 from flytune.tune.requirement import Measured, Requirement
 from flytune.tune.result import Tuning, Verdict
 from flytune.tune.rules import Rule, field_of, is_whole
@@ -283,43 +284,17 @@ class Tuner:
     def _folder(self, number: int) -> Path:
         return self.out / "steps" / f"{number:02d}"
 
-    # what is written down
-
     def _write(self, ended: dict[str, Any] | None = None) -> None:
-        told = {
-            "schema": 1, **self.asked, "start": self.start.name, "duration": self.duration,
-            "steps": [step.to_dict() for step in self.steps],
-            "verdicts": [dataclasses.asdict(verdict) for verdict in self.verdicts], **(ended or {}),
-        }  # fmt: skip
-        try:
-            self.out.mkdir(parents=True, exist_ok=True)
-            write_text(self.out / "tune.json", json.dumps(told, indent=2) + "\n")
-        except OSError as error:
-            raise BadInput(f"out: {self.out} cannot be written ({error.strerror}). Give another directory.") from None
+        about = {"start": self.start.name, "duration": self.duration, **(ended or {})}
+        write_journal(self.out, self.asked, self.steps, self.verdicts, about)
 
     def resume(self) -> None:
-        """Take up the steps that `tune.json` holds.
+        """Take up the steps that the directory's journal holds.
 
         Raises:
             BadInput: there is none, it is damaged, or something else was asked.
         """
-        path = self.out / "tune.json"
-        try:
-            told = json.loads(path.read_text(encoding="utf-8"))
-            steps = [Step.from_dict(each) for each in told["steps"]]
-            verdicts = [Verdict(**each) for each in told["verdicts"]]
-            asked = {name: told[name] for name in self.asked}
-        except OSError:
-            raise BadInput(f"resume: {self.out} holds no tuning. Leave out --resume to start one.") from None
-        except (ValueError, KeyError, TypeError, AttributeError) as error:
-            raise BadInput(f"resume: {path} is damaged ({error}). Tune again into another directory.") from None
-        now = json.loads(json.dumps(self.asked))
-        changed = ["task" if name == "tables" else name for name in now if now[name] != asked[name]]
-        if changed:
-            raise BadInput(
-                f"resume: {self.out} was asked for another {changed[0]}. Give the same, or another directory."
-            )
-        self.steps, self.verdicts = steps, verdicts
+        self.steps, self.verdicts = read_journal(self.out, self.asked)
 
 
 def new_tuning_directory(requirement: Requirement, parent: Path = Path("runs")) -> Path:
