@@ -24,7 +24,7 @@ from flytune.tune.result import Tuning, Verdict
 from flytune.tune.rules import Rule, field_of, is_whole
 from flytune.tune.start import TUNING_SEED, TUNING_TRIALS, edited, find_start, fly_for, tuning_duration
 from flytune.tune.step import Edit, Step
-from flytune.tune.words import describe, describe_edit, describe_miss, describe_step, describe_targets, said_of
+from flytune.tune.words import describe, describe_edit, describe_miss, describe_step, describe_targets
 
 FRESH_SEED, FRESH_TRIALS = 4000, 200  # the starts of a verdict; each verdict has its own
 MOST_STEPS = 12
@@ -169,8 +169,10 @@ class Tuner:
             self.tell(f"start    {start.name}: nothing that flies this task is known; it is trained from nothing")
             self.train(0, {}, {}, None, None)
             return
-        times = ", ".join(f"{name} {said_of('settling_time', time, self.requirement)}"
-                          for name, time in start.times.items())  # fmt: skip
+        never = f"not within {self.duration:g} s"
+        times = ", ".join(
+            f"{name} {f'{time:.2f} s' if math.isfinite(time) else never}" for name, time in start.times.items()
+        )
         nearest = f"; {start.name} is nearest, as a ratio" if len(start.times) > 1 else ""
         self.tell(f"start    known tasks, as their policies settle: {times}{nearest}")
         folder = self._folder(0)
