@@ -28,7 +28,7 @@ EDIT = Edit(
 def test_an_edit_says_what_is_missing_what_is_edited_what_is_expected_and_why():
     assert describe_edit(EDIT, WANTED) == (
         "too slow: termination.speed.bound 0.2 -> 0.304 m/s, expects settling time 5.99 s (settling time ~ bound^-1.4 "
-        "between 0.3 and 0.5 of the effect map). H7 faster: a higher speed bound shortens the cruise. "
+        "between 0.3 and 0.5 of the effect map, extrapolated). H7 faster: a higher speed bound shortens the cruise. "
         "Next best: reward.velocity.weight 0.1 -> 0.05, expects settling time 10.31 s (H6 faster)"
     )
 
@@ -38,14 +38,15 @@ def test_an_edit_says_what_is_missing_what_is_edited_what_is_expected_and_why():
     [
         ({"known_from": "flown"}, "(settling time ~ bound^-1.4 in the steps at 0.3 and 0.5)"),
         ({"known_from": "rule", "ends": None}, "(settling time ~ bound^-1.4, the rule's own guess, not measured)"),
-        ({"known_from": "between"}, "(interpolated between the steps at 0.3 and 0.5, one too slow and one too fast)"),
+        ({"known_from": "between"}, "(false position between the steps at 0.3 and 0.5, one too slow and one too fast)"),
         ({"expects": None, "condition": "unsettled"}, "0.304 m/s (no number can be promised: the rule's largest step)"),
         ({"expects": None, "rule": HALF_WAY}, "too far: termination.speed.bound 0.2 -> 0.304 m/s (half-way back"),
+        ({"before": 0.3}, "between 0.3 and 0.5 of the effect map). H7"),
         ({"unit": "1/unit(e)^2"}, "0.2 -> 0.304, expects"),
         ({"condition": "inexact", "expects": 0.002}, "expects error 2.00 mm (error ~ bound"),
         ({"source": "flytune: docs"}, "shortens the cruise (flytune: docs). Next"),
     ],
-    ids=["flown", "rule", "between", "no-number", "half-way", "no-unit", "error", "source"],
+    ids=["flown", "rule", "between", "no-number", "half-way", "inside", "no-unit", "error", "source"],
 )
 def test_an_edit_says_where_its_size_comes_from(changes, said):
     assert said in describe_edit(dataclasses.replace(EDIT, **changes), WANTED)
@@ -65,6 +66,10 @@ def test_a_step_says_what_it_was_and_what_was_expected_beside_what_it_is():
         "settles in 7.42 s (was 10.60 s, expected 5.99 s), overshoot 1.2 %, error 1.30 mm, 100.0 % settled; "
         "missing: 24 % too slow for 6 s"
     )
+
+
+def test_bounds_the_user_has_set_are_always_told():
+    assert describe(AFTER, WANTED, bounds=True).endswith("100.0 % settled, your bounds kept in 100.0 %")
 
 
 def test_a_response_says_all_that_is_asked_of_it():

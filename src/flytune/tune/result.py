@@ -30,6 +30,7 @@ class Tuning:
     best: int
     blocked: list[str]  # why no rule could help, where it ended without success
     directory: Path
+    bounds: tuple[str, ...] = ()  # terminations the user has set
 
     @property
     def met(self) -> bool:
@@ -53,7 +54,7 @@ class Tuning:
                     "number": step.number,
                     "origin": step.origin,
                     "edit": describe_edit(step.edit, target) if step.edit else f"start: {self.start}",
-                    "response": describe_step(step, before, target),
+                    "response": describe_step(step, before, target, bounds=bool(self.bounds)),
                     "seconds": step.seconds,
                     "measured": step.measured.to_dict(),
                 }

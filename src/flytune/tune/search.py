@@ -158,8 +158,8 @@ class Tuner:
             self.steps[index] = dataclasses.replace(step, measured=measured, looks=len(starts))
             if step.number == self.verdicts[-1].step:
                 trials = sum(number for _, number in starts)
-                self.tell(f"again    step {step.number} on all {trials} starts seen so far, tuning starts from now on: "
-                          f"{describe_step(self.steps[index], None, self.target)}")  # fmt: skip
+                said = describe_step(self.steps[index], None, self.target, bounds=bool(self.bounds))
+                self.tell(f"again    step {step.number} on all {trials} starts seen so far, tuning starts now: {said}")
         self._write()
 
     def begin(self) -> None:
@@ -247,7 +247,7 @@ class Tuner:
 
     def _say(self, step: Step) -> None:
         before = self.steps[step.origin].measured if step.origin is not None else None
-        self.tell(f"step {step.number:<3} {describe_step(step, before, self.target)}")
+        self.tell(f"step {step.number:<3} {describe_step(step, before, self.target, bounds=bool(self.bounds))}")
 
     def verdict(self, step: Step) -> Verdict:
         """The step on starts of its own."""
@@ -262,8 +262,9 @@ class Tuner:
         self.verdicts.append(verdict)
         self._write()
         missing = ", ".join(describe_miss(name, size, self.requirement) for name, size in verdict.misses.items())
-        self.tell(f"fresh    step {step.number} on {FRESH_TRIALS} starts never flown before: "
-                  f"{describe(measured, self.requirement)}; {f'missing: {missing}' if missing else 'met'}")  # fmt: skip
+        said = describe(measured, self.requirement, bounds=bool(self.bounds))
+        self.tell(f"fresh    step {step.number} on {FRESH_TRIALS} starts never flown before: {said}; "
+                  f"{f'missing: {missing}' if missing else 'met'}")  # fmt: skip
         return verdict
 
     def _end(self, best: int, blocked: list[str]) -> Tuning:
@@ -278,7 +279,7 @@ class Tuner:
             write_text(self.out / "evaluation.json", json.dumps(told, indent=2) + "\n")
         result = Tuning(
             requirement=self.requirement, start=self.start.name, steps=self.steps, verdicts=self.verdicts, best=best,
-            blocked=blocked, directory=self.out,
+            blocked=blocked, directory=self.out, bounds=self.bounds,
         )  # fmt: skip
         self._write({"best": best, "met": result.met, "blocked": blocked})
         return result

@@ -6,8 +6,10 @@ from flytune.tune.requirement import FAR, Measured, Requirement
 from flytune.tune.step import HALF_WAY, Edit, Step
 
 
-def describe(measured: Measured, requirement: Requirement, notes: dict[str, str] | None = None) -> str:
-    """A measured response in words; `notes` says more of a measure."""
+def describe(
+    measured: Measured, requirement: Requirement, notes: dict[str, str] | None = None, *, bounds: bool = False
+) -> str:
+    """A measured response in words; `notes` says more of a measure, `bounds` that the user has set some."""
     settles = math.isfinite(measured.settling_time)
     said = {name: said_of(name, getattr(measured, name), requirement) for name in vars(measured)}
     words = {
@@ -17,7 +19,7 @@ def describe(measured: Measured, requirement: Requirement, notes: dict[str, str]
         "settled": f"{said['settled']} settled",
         "kept": f"your bounds kept in {said['kept']}",
     }
-    shown = [name for name in words if name != "kept" or measured.kept < 1 or "kept" in (notes or {})]
+    shown = [name for name in words if name != "kept" or bounds or measured.kept < 1]
     return ", ".join(words[name] + (notes or {}).get(name, "") for name in shown)
 
 
@@ -46,7 +48,7 @@ def describe_edit(edit: Edit, requirement: Requirement) -> str:
     return f"{condition}: {_change(edit, requirement)}{known}. {edit.rule}: {edit.says}{source}{second}"
 
 
-def describe_step(step: Step, before: Measured | None, requirement: Requirement) -> str:
+def describe_step(step: Step, before: Measured | None, requirement: Requirement, *, bounds: bool = False) -> str:
     """What a step's response is beside what it was and what was expected of its edit, and what is missing."""
     if step.diverged:
         return f"diverged: {step.diverged}"
@@ -59,7 +61,9 @@ def describe_step(step: Step, before: Measured | None, requirement: Requirement)
         notes[measure] = f" ({note})"
     misses = requirement.misses(step.measured)
     missing = ", ".join(describe_miss(name, size, requirement) for name, size in misses.items())
-    return f"{describe(step.measured, requirement, notes)}; {f'missing: {missing}' if missing else 'met'}"
+    return (
+        f"{describe(step.measured, requirement, notes, bounds=bounds)}; {f'missing: {missing}' if missing else 'met'}"
+    )
 
 
 def describe_miss(measure: str, size: float, requirement: Requirement) -> str:
@@ -109,9 +113,10 @@ def _known(edit: Edit) -> str:
     if edit.ends is None:
         return f"{law}, the rule's own guess, not measured"
     low, high = sorted(edit.ends)
+    inside = low <= min(edit.before, edit.after) and max(edit.before, edit.after) <= high
     where = {
         "flown": f"{law} in the steps at {low:g} and {high:g}",
-        "map": f"{law} between {low:g} and {high:g} of the effect map",
-        "between": f"interpolated between the steps at {low:.3g} and {high:.3g}, one too slow and one too fast",
+        "map": f"{law} between {low:g} and {high:g} of the effect map{'' if inside else ', extrapolated'}",
+        "between": f"false position between the steps at {low:.3g} and {high:.3g}, one too slow and one too fast",
     }
     return where[edit.known_from]
