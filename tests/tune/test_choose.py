@@ -244,6 +244,18 @@ def test_a_step_flown_nearby_says_what_an_edit_would_break():
     assert (origin.number, edit.field) == (1, "apg.updates")
 
 
+def test_an_edit_that_the_task_cannot_have_beside_its_other_fields_is_left_out():
+    # narrow may not be wider than wide
+    tables = document.edit(TABLES, "reward.horizontal.wide", 15.0)
+    lower = dataclasses.replace(
+        RULES[0], field="reward.horizontal.narrow", direction="down", slope=0.8, range=(1.0, 100.0)
+    )
+    found = choose([step(settling_time=4.0)], tables, make_requirement(2), [lower], UNKNOWN, ())
+    assert found == ["H7 faster (reward.horizontal.narrow 8.41 is not allowed in this task)"]
+    _, edit = choose([step(settling_time=4.0)], tables, make_requirement(2), [lower, RULES[0]], UNKNOWN, ())
+    assert (edit.field, edit.second) == (SPEED, None)
+
+
 def test_the_next_best_edit_is_of_another_field():
     _, edit = chosen([step(settling_time=4.0)], make_requirement(2))
     assert edit.second is not None

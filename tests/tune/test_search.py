@@ -126,14 +126,6 @@ def test_what_cannot_be_tuned_is_refused_before_anything_is_written(tmp_path, ch
     assert not (tmp_path / "t").exists()
 
 
-def test_a_rule_that_could_move_its_field_where_it_may_not_be_is_refused(tmp_path):
-    rule = Rule(
-        name="mine", when="too slow", field="reward.horizontal.share", direction="up", slope=-0.1, range=(0.1, 1.5)
-    )
-    with pytest.raises(BadInput, match=r"rules: mine: range: reward\.horizontal\.share: 1\.5 is not allowed"):
-        tune(make_requirement(2.0), [rule], tmp_path / "t")
-
-
 def test_a_directory_that_cannot_be_written_is_one_line(tmp_path):
     (tmp_path / "file").write_text("")
     for out in (tmp_path / "file" / "t", tmp_path / ("n" * 300)):

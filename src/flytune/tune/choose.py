@@ -6,10 +6,11 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from flytune import document
+from flytune.errors import BadInput
 from flytune.task.task import Task
 from flytune.tune.effects import FLOOR, Effects
 from flytune.tune.requirement import Requirement
-from flytune.tune.rules import Rule, conditions, field_of, is_fixed, moved
+from flytune.tune.rules import Rule, conditions, field_of, is_fixed, is_whole, moved
 from flytune.tune.step import HALF_WAY, Edit, Step
 
 TRUST = {"between": 1.0, "flown": 1.0, "map": 0.9, "rule": 0.6}  # in a slope, by where it comes from
@@ -72,9 +73,26 @@ def choose(
     if not options:
         return [f"{condition}: {', '.join(reasons)}" for condition, reasons in refused.items()]
     options.sort(key=lambda option: option[:2])
-    _, number, best = options[0]
-    second = next((edit for _, other, edit in options if other == number and edit.field != best.field), None)
+    allowed = (option for option in options if _allowed(case, steps[-option[1]], option[2]))
+    chosen = next(allowed, None)
+    if chosen is None:
+        edits = {f"{edit.rule} ({edit.field} {edit.after:g} is not allowed in this task)" for _, _, edit in options}
+        return sorted(edits)
+    _, number, best = chosen
+    second = next((edit for _, other, edit in allowed if other == number and edit.field != best.field), None)
     return steps[-number], dataclasses.replace(best, second=second)
+
+
+def _allowed(case: _Case, step: Step, edit: Edit) -> bool:
+    """Whether the task can have the edit: a field may be bound by another, as `narrow` is by `wide`."""
+    tables = dict(case.tables)
+    for path, value in {**step.values, edit.field: edit.after}.items():
+        tables = document.edit(tables, path, round(value) if is_whole(tables, path) else value)
+    try:
+        document.read(Task, tables)
+    except BadInput:
+        return False
+    return True
 
 
 def _left(case: _Case, step: Step) -> float:

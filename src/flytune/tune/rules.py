@@ -2,7 +2,7 @@
 
 import dataclasses
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from importlib import resources
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -104,20 +104,22 @@ def conditions(misses: dict[str, float]) -> list[str]:
     return found
 
 
-def field_of(task: dict[str, Any], path: str) -> float | None:
+def field_of(task: Mapping[str, Any], path: str) -> float | None:
     """The number at a field path of a task's tables; None where the task has no such number."""
-    node: Any = task
-    for part in path.split("."):
-        node = node.get(part) if isinstance(node, dict) else None
-    return float(node) if isinstance(node, int | float) and not isinstance(node, bool) else None
+    number = _number_at(task, path)
+    return None if number is None else float(number)
 
 
-def is_whole(task: dict[str, Any], path: str) -> bool:
+def is_whole(task: Mapping[str, Any], path: str) -> bool:
     """Whether the number at a field path of a task's tables is a whole one, and has to stay so."""
+    return isinstance(_number_at(task, path), int)
+
+
+def _number_at(task: Mapping[str, Any], path: str) -> int | float | None:
     node: Any = task
     for part in path.split("."):
-        node = node.get(part) if isinstance(node, dict) else None
-    return isinstance(node, int) and not isinstance(node, bool)
+        node = node.get(part) if isinstance(node, Mapping) else None
+    return node if isinstance(node, int | float) and not isinstance(node, bool) else None
 
 
 def is_fixed(path: str, fixed: Sequence[str]) -> bool:

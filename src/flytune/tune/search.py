@@ -21,7 +21,7 @@ from flytune.tune.effects import load_effects
 from flytune.tune.journal import read_journal, write_journal
 from flytune.tune.requirement import Measured, Requirement
 from flytune.tune.result import Tuning, Verdict
-from flytune.tune.rules import Rule, field_of, is_whole
+from flytune.tune.rules import Rule, is_whole
 from flytune.tune.start import TUNING_SEED, TUNING_TRIALS, edited, find_start, fly_for, tuning_duration
 from flytune.tune.step import Edit, Step
 from flytune.tune.words import describe, describe_edit, describe_miss, describe_step, describe_targets
@@ -75,10 +75,6 @@ class Tuner:
             for name in self.start.task.termination
             if any(f"{path}.".startswith(f"termination.{name}.") or path == "termination" for path in edits)
         )
-        for rule in rules:
-            if rule.field and field_of(self.tables, rule.field) is not None:
-                for end in rule.range:
-                    self._check(rule, end)
 
     # the loop
 
@@ -123,13 +119,6 @@ class Tuner:
             return far, step.number in judged, left, step.number
 
         return min((step for step in self.steps if not step.diverged), key=order)
-
-    def _check(self, rule: Rule, value: float) -> None:
-        """Refuse a rule that could move its field to a value the task cannot have."""
-        try:
-            self.task_of(len(self.steps) + 1, {rule.field: value}, {rule.field: rule.name})
-        except BadInput as error:
-            raise BadInput(f"rules: {rule.name}: range: {error}") from None
 
     def _is_ready(self, step: Step) -> bool:
         """Whether a step meets the requirement on all tuning starts, and was not judged too often."""
