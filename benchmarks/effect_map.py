@@ -1,12 +1,12 @@
-"""What each knob of a task really does to the response: the effect map that the tuner reads.
+"""What each parameter of a task really does to the response: the effect map that the tuner reads.
 
     python benchmarks/effect_map.py --out effect-map    # trains what is missing there, then writes the package's data
     python benchmarks/effect_map.py --docs              # draws docs/heuristics/ from it
 
-One knob of baseline-refined at a time, five values, three seeds of episodes and noise; trained as the tuner trains, on
+One parameter of baseline-refined at a time, five values, three seeds of episodes and noise; trained as the tuner trains, on
 from the policy that ships. (From new weights, 300 updates leave the unchanged baseline at 5.4 s, on its way to 3.0 s:
 what is then measured is how far a training has come.) The unchanged task is trained once per seed and stands in the
-curve of every knob. Processes side by side, one per core.
+curve of every parameter. Processes side by side, one per core.
 """
 
 import argparse
@@ -20,7 +20,7 @@ from pathlib import Path
 
 BASE = "baseline-refined"
 TRIALS, DURATION, SEED = 100, 20.0, 2000  # of the judgement
-KNOBS = {
+PARAMETERS = {
     "reward.survival.reward": (0.0, 0.02, 0.05, 0.1, 0.3),
     "reward.horizontal.wide": (0.125, 0.25, 0.5, 1.0, 4.0),
     "reward.horizontal.share": (0.2, 0.4, 0.6, 0.8, 0.95),
@@ -39,41 +39,41 @@ DOCS = HERE / "docs" / "heuristics"
 
 
 def jobs(seeds: int) -> list[tuple[str | None, float | None, int]]:
-    """Every training: knob, value, seed; the unchanged task once per seed."""
-    from flytune.document import plain
+    """Every training: parameter, value, seed; the unchanged task once per seed."""
+    from flytune.config.document import plain
     from flytune.task.task import load_task
-    from flytune.tune.rules import field_of
+    from flytune.tuning.rules import field_of
 
     tables = plain(load_task(BASE))
     changed = [
-        (knob, value, seed)
-        for knob, values in KNOBS.items()
+        (parameter, value, seed)
+        for parameter, values in PARAMETERS.items()
         for value in values
         for seed in range(seeds)
-        if value != field_of(tables, knob)
+        if value != field_of(tables, parameter)
     ]
     return [(None, None, seed) for seed in range(seeds)] + changed
 
 
 def file_of(folder: Path, job: tuple[str | None, float | None, int]) -> Path:
     """Where the judgement of a training is kept."""
-    knob, value, seed = job
-    return folder / f"{knob or 'baseline'}-{'' if value is None else f'{value:g}'}-s{seed}.json"
+    parameter, value, seed = job
+    return folder / f"{parameter or 'baseline'}-{'' if value is None else f'{value:g}'}-s{seed}.json"
 
 
 def fly_one(folder: Path, updates: int, job: tuple[str | None, float | None, int]) -> None:
     """Train one task and write down how it flies."""
     from flytune.control.policy import load_policy
     from flytune.errors import Diverged
-    from flytune.learn.run import train
-    from flytune.learn.shipped import shipped_files
-    from flytune.response.fly import fly
-    from flytune.response.judge import AXES, judge
+    from flytune.evaluation.fly import fly
+    from flytune.evaluation.judge import AXES, judge
+    from flytune.runs.shipped import shipped_files
     from flytune.task.task import load_task
+    from flytune.training.loop import train
 
-    knob, value, seed = job
+    parameter, value, seed = job
     settings = {"apg.updates": updates, "apg.learning_rate": 0.002}
-    task = load_task(BASE, settings | ({} if knob is None else {knob: value}))
+    task = load_task(BASE, settings | ({} if parameter is None else {parameter: value}))
     initial = load_policy(shipped_files(BASE)[0])
     began = time.monotonic()
     row = {"seed": seed, "settled": 0, "settling_time": None, "overshoot": None, "error": None}
@@ -118,15 +118,15 @@ def measure(folder: Path, updates: int, seeds: int, workers: int) -> None:
         with multiprocessing.get_context("spawn").Pool(workers) as pool:
             pool.starmap(fly_one, missing, chunksize=1)
 
-    from flytune.document import plain
+    from flytune.config.document import plain
     from flytune.task.task import load_task
-    from flytune.tune.rules import field_of
+    from flytune.tuning.rules import field_of
 
     tables = plain(load_task(BASE))
 
-    def rows(knob: str, value: float, baseline: float) -> list[dict]:
+    def rows(parameter: str, value: float, baseline: float) -> list[dict]:
         unchanged = value == baseline
-        files = [file_of(folder, (None, None, s) if unchanged else (knob, value, s)) for s in range(seeds)]
+        files = [file_of(folder, (None, None, s) if unchanged else (parameter, value, s)) for s in range(seeds)]
         return [json.loads(file.read_text(encoding="utf-8")) for file in files]
 
     told = {
@@ -138,12 +138,12 @@ def measure(folder: Path, updates: int, seeds: int, workers: int) -> None:
         "seeds": list(range(seeds)),
         "versions": {name: metadata.version(name) for name in ("flytune", "jax")}
         | {"python": platform.python_version()},
-        "knobs": {
-            knob: {
-                "baseline": (baseline := field_of(tables, knob)),
-                "points": [{"value": value, "seeds": rows(knob, value, baseline)} for value in values],
+        "parameters": {
+            parameter: {
+                "baseline": (baseline := field_of(tables, parameter)),
+                "points": [{"value": value, "seeds": rows(parameter, value, baseline)} for value in values],
             }
-            for knob, values in KNOBS.items()
+            for parameter, values in PARAMETERS.items()
         },
     }
     DATA.write_text(json.dumps(told, indent=1) + "\n", encoding="utf-8")
@@ -152,8 +152,8 @@ def measure(folder: Path, updates: int, seeds: int, workers: int) -> None:
 
 def document_it() -> None:
     """Tables and the drawing from the measured data."""
-    from flytune.tune.effects import load_effects
-    from flytune.tune.heuristics import draw_effects, heuristics_tables
+    from flytune.tuning.heuristics import draw_effects, heuristics_tables
+    from flytune.tuning.sensitivity import load_effects
 
     effects = load_effects()
     DOCS.mkdir(exist_ok=True)

@@ -16,11 +16,11 @@ from pathlib import Path
 import numpy as np
 
 from flytune.control.policy import load_policy
-from flytune.learn.directory import read_facts
-from flytune.learn.shipped import HOME
-from flytune.reproduce.study import ROLES, Study
-from flytune.response.fly import fly
-from flytune.response.judge import AXES, judge
+from flytune.evaluation.fly import fly
+from flytune.evaluation.judge import AXES, judge
+from flytune.reproduction.study import ROLES, Study
+from flytune.runs.directory import read_facts
+from flytune.runs.shipped import HOME
 
 SEED = 1000  # of starts and noise; evaluations use 1
 

@@ -1,4 +1,4 @@
-"""Tunes the classical pilots with Optuna and prints their gains as a TOML table; needs flytune[optuna].
+"""Tunes the classical controllers with Optuna and prints their gains as a TOML table; needs flytune[optuna].
 
     python benchmarks/tune_classical.py pid geometric lqr
     python benchmarks/tune_classical.py pid --trials 400 --write
@@ -28,8 +28,8 @@ import numpy as np
 import tomlkit
 
 import flytune
-from flytune import document
-from flytune.control.classical import CLASSICAL, AnyGains, pilot_with, read_gains
+from flytune.config import document
+from flytune.control.classical import CLASSICAL, AnyGains, controller_with, read_gains
 from flytune.errors import FlytuneError
 from flytune.extras import require
 from flytune.task.task import Task
@@ -51,7 +51,7 @@ def cost(gains: AnyGains, tasks: list[Task]) -> float:
 
 
 def _cost(gains: AnyGains, task: Task) -> float:
-    judgement = flytune.judge(flytune.fly(pilot_with(gains, task), task, trials=FLIGHTS, seed=STARTS_SEED))
+    judgement = flytune.judge(flytune.fly(controller_with(gains, task), task, trials=FLIGHTS, seed=STARTS_SEED))
     late = 2 * task.duration
     position, yaw = (np.minimum(judgement.settling_time[channel], late).mean() for channel in ("position", "yaw"))
     crossed = np.mean(np.logical_or.reduce(list(judgement.violated.values())))
@@ -97,7 +97,7 @@ def main() -> None:
     """Tune what the command line names."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("names", nargs="+", choices=CLASSICAL)
-    parser.add_argument("--trials", type=int, default=300, help="sets of gains to try per pilot (default 300)")
+    parser.add_argument("--trials", type=int, default=300, help="sets of gains to try per controller (default 300)")
     parser.add_argument("--seed", type=int, default=0, help="of the sampler (default 0)")
     parser.add_argument("--vehicles", default="crazyflie", help="flown by each trial, separated by commas")
     parser.add_argument("--write", action="store_true", help="write the gains into the package's files")

@@ -74,13 +74,13 @@ def solve(folder: Path, index: int, method: str, seed: int) -> None:
     """One requirement by one method, written down."""
     import jax
 
+    from flytune.config.document import plain
     from flytune.control.policy import Policy, load_policy
-    from flytune.document import plain
     from flytune.errors import BadInput
     from flytune.task.task import Task
-    from flytune.tune.requirement import make_requirement
-    from flytune.tune.rules import load_rules
-    from flytune.tune.search import Tuner
+    from flytune.tuning.requirement import make_requirement
+    from flytune.tuning.rules import load_rules
+    from flytune.tuning.search import Tuner
 
     class CachedTuner(Tuner):
         """A tuner that makes no training twice."""
@@ -139,7 +139,7 @@ def search(tuner: Any, method: str, seed: int) -> bool:
     """Whether Optuna meets what the tuner is asked for, from the policy the tuner begins with, within the budget."""
     import optuna
 
-    from flytune.tune.rules import field_of
+    from flytune.tuning.rules import field_of
 
     optuna.logging.set_verbosity(optuna.logging.WARNING)
 
@@ -186,7 +186,7 @@ def search(tuner: Any, method: str, seed: int) -> bool:
 
 def summary(folder: Path) -> str:
     """The results as Markdown: success and median per method, then every requirement."""
-    from flytune.response.statistics import bootstrap_interval
+    from flytune.evaluation.statistics import bootstrap_interval
 
     rows = [json.loads(path.read_text(encoding="utf-8")) for path in sorted(folder.glob("*-*.json"))]
     methods = [method for method in ("tuner", "tpe", "random") if any(row["method"] == method for row in rows)]

@@ -20,19 +20,19 @@ import numpy as np
 from integrator import METHODS, errors, manoeuvre
 from integrator import reference as dop853
 
-from flytune.bridges.actuator import SIDE, SPIN, Actuator
-from flytune.bridges.aerodynamics import ground_effect, rotor_drag
-from flytune.bridges.world import Body, to_inertial
-from flytune.bridges.worlds import make_world
+from flytune.config.pytree import pytree
 from flytune.control.policy import load_policy
+from flytune.evaluation.fly import fly
+from flytune.evaluation.judge import Judgement, judge
+from flytune.evaluation.statistics import bootstrap_interval, median
 from flytune.physics import rotation
 from flytune.physics.components import pack, unpack
 from flytune.physics.dynamics import CONTROL_PERIOD
 from flytune.physics.vehicle import Vehicle, load_vehicle
-from flytune.pytree import pytree
-from flytune.response.fly import fly
-from flytune.response.judge import Judgement, judge
-from flytune.response.statistics import bootstrap_interval, median
+from flytune.simulation.actuator import SIDE, SPIN, Actuator
+from flytune.simulation.aerodynamics import ground_effect, rotor_drag
+from flytune.simulation.simulator import VehicleStates, to_inertial
+from flytune.simulation.simulators import make_simulator
 from flytune.task.task import load_task
 
 MANOEUVRES = {"moderate": (1.0, 0.05, 0.04, 0.06), "hard": (2.2, 0.37, 0.3, 0.1)}  # see integrator.manoeuvre
@@ -94,18 +94,20 @@ def equations(
 
 def fly_open_loop(vehicle: Vehicle, actions: np.ndarray, name: str, options: dict[str, Any]) -> Trajectory:
     """The same actions from the same hover, in a world."""
-    world = make_world(name, vehicle, 1, options)
+    simulator = make_simulator(name, vehicle, 1, options)
     hover = np.full((1, 4), vehicle.hover_rotor_speed_rpm)
     level, still = np.array([[0, 0, 0, 1.0]]), np.zeros((1, 3))
     start = np.array([[0, 0, 1.0]])
-    world.place(Body(position=start, attitude=level, velocity=still, body_rate=still, rotor_speed_rpm=hover))
+    simulator.place(
+        VehicleStates(position=start, attitude=level, velocity=still, body_rate=still, rotor_speed_rpm=hover)
+    )
     flown = []
     for action in [None, *actions]:
         if action is not None:
-            world.advance(action[None])
-        body = world.body()
+            simulator.advance(action[None])
+        body = simulator.body()
         flown.append(np.concatenate([body.position[0], body.attitude[0], body.velocity[0], body.body_rate[0]]))
-    world.close()
+    simulator.close()
     return np.array(flown)
 
 
@@ -180,27 +182,27 @@ def compare_causes(vehicle: Vehicle, actions: np.ndarray) -> None:
 
 @pytree
 class RateInInertialFrame:
-    """A pilot who is shown the angular velocity in the inertial frame where it expects the body rate (target yaw 0)."""
+    """A controller who is shown the angular velocity in the inertial frame where it expects the body rate (target yaw 0)."""
 
-    pilot: Any
+    controller: Any
 
     def initial_memory(self) -> Any:
-        """The pilot's own."""
-        return self.pilot.initial_memory()
+        """The controller's own."""
+        return self.controller.initial_memory()
 
     def act(self, memory: Any, observation: Any) -> tuple[Any, Any]:
-        """The pilot's answer to the wrong numbers."""
+        """The controller's answer to the wrong numbers."""
         numbers = unpack(observation)
         attitude, rate = numbers[3:7], numbers[10:13]
         turned = rotation.multiply(rotation.multiply(attitude, (*rate, jnp.zeros(()))), rotation.conjugate(attitude))
-        return self.pilot.act(memory, pack((*numbers[:10], *turned[:3], *numbers[13:])))
+        return self.controller.act(memory, pack((*numbers[:10], *turned[:3], *numbers[13:])))
 
 
 def compare_responses(file: Path) -> None:
     """The same policy, starts and noise in every world."""
     policy, task = load_policy(file), load_task("baseline")
     everything = {"damping": 0.04, "ground_effect": True, "rotor_drag": True}
-    wrong = RateInInertialFrame(pilot=policy)
+    wrong = RateInInertialFrame(controller=policy)
     flights: list[tuple[str, Any, str, dict[str, Any]]] = [
         ("flytune", policy, "flytune", {}),
         ("MuJoCo, RK4", policy, "mujoco", {}),
@@ -225,8 +227,8 @@ def compare_responses(file: Path) -> None:
         "z [s] (95 %)",
     )
     first = None
-    for label, pilot, name, options in flights:
-        result = judge(fly(pilot, task, world=name, world_options=options))
+    for label, controller, name, options in flights:
+        result = judge(fly(controller, task, simulator=name, simulator_options=options))
         first = first or result
         settled = ", ".join(str(result.settled(axis)) for axis in ("x", "y", "z", "yaw"))
         times = ", ".join(_number(median(result.settling_time[axis]), ".2f") for axis in ("x", "y", "z", "yaw"))

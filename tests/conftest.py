@@ -17,8 +17,8 @@ from jaxtyping import install_import_hook
 from tests.chromium import BROWSERS, ON_A_MAC, Browser
 
 # without physics.vehicle, whose properties promise a float and give a tracer in compiled code, and without
-# response.fly and the rooms above it, which refuse a bad argument in their own words
-CHECKED = "control, document, env, physics.dynamics, physics.rotation, response.judge, response.metrics, task"
+# evaluation.fly and the rooms above it, which refuse a bad argument in their own words
+CHECKED = "control, config.document, simulation.environment, physics.dynamics, physics.rotation, evaluation.judge, evaluation.metrics, task"
 
 
 def check_functions(function):

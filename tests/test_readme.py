@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from flytune.cli import _parser
+from flytune.cli.main import _parser
 
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
@@ -23,7 +23,7 @@ def test_every_command_of_the_readme_is_understood(command):
 
 
 def test_every_edit_of_the_readme_changes_the_task():
-    from flytune.document import parse_assignment
+    from flytune.config.document import parse_assignment
     from flytune.task.task import load_task, write_task
 
     edits = [word for command in COMMANDS for word in shlex.split(command, comments=True) if "=" in word]
@@ -41,9 +41,9 @@ def test_every_file_the_readme_links_to_is_there():
 
 def test_the_names_the_readme_lists_are_the_ones_that_ship():
     from flytune.control.classical import CLASSICAL
-    from flytune.learn.run import TRAINERS
     from flytune.physics.vehicle import vehicle_names
     from flytune.task.task import preset_names
+    from flytune.training.loop import TRAINERS
 
     extras = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]["optional-dependencies"]
     first_cells = re.findall(r"^\| (`[^|]+`)", README, flags=re.MULTILINE)

@@ -13,49 +13,49 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from flytune.control.classical import classical_pilot
+    from flytune.control.classical import classical_controller
     from flytune.control.policy import Policy, load_policy, save_policy
     from flytune.errors import BadInput, Diverged, FlytuneError, Interrupted
+    from flytune.evaluation.comparison import Comparison, compare
+    from flytune.evaluation.flights import Flights
+    from flytune.evaluation.fly import fly
+    from flytune.evaluation.judge import Judgement, judge
     from flytune.export.onnx import save_onnx
-    from flytune.export.onnx_pilot import load_onnx
-    from flytune.learn.pilot import find_pilot
-    from flytune.learn.run import Run, train
+    from flytune.export.untrusted.onnx_controller import load_onnx
     from flytune.physics.vehicle import Vehicle, load_vehicle
-    from flytune.response.compare import Comparison, compare
-    from flytune.response.flights import Flights
-    from flytune.response.fly import fly
-    from flytune.response.judge import Judgement, judge
-    from flytune.show.comparison import write_comparison
-    from flytune.show.report import Entry, write_report
+    from flytune.report.comparison import write_comparison
+    from flytune.report.report import Entry, write_report
+    from flytune.runs.find import find_controller
     from flytune.task.task import Task, load_task, write_task
+    from flytune.training.loop import Run, train
 
 _HOMES = {
     "BadInput": "flytune.errors",
-    "Comparison": "flytune.response.compare",
+    "Comparison": "flytune.evaluation.comparison",
     "Diverged": "flytune.errors",
-    "Entry": "flytune.show.report",
-    "Flights": "flytune.response.flights",
+    "Entry": "flytune.report.report",
+    "Flights": "flytune.evaluation.flights",
     "FlytuneError": "flytune.errors",
     "Interrupted": "flytune.errors",
-    "Judgement": "flytune.response.judge",
+    "Judgement": "flytune.evaluation.judge",
     "Policy": "flytune.control.policy",
-    "Run": "flytune.learn.run",
+    "Run": "flytune.training.loop",
     "Task": "flytune.task.task",
     "Vehicle": "flytune.physics.vehicle",
-    "classical_pilot": "flytune.control.classical",
-    "compare": "flytune.response.compare",
-    "find_pilot": "flytune.learn.pilot",
-    "fly": "flytune.response.fly",
-    "judge": "flytune.response.judge",
-    "load_onnx": "flytune.export.onnx_pilot",
+    "classical_controller": "flytune.control.classical",
+    "compare": "flytune.evaluation.comparison",
+    "find_controller": "flytune.runs.find",
+    "fly": "flytune.evaluation.fly",
+    "judge": "flytune.evaluation.judge",
+    "load_onnx": "flytune.export.untrusted.onnx_controller",
     "load_policy": "flytune.control.policy",
     "load_task": "flytune.task.task",
     "load_vehicle": "flytune.physics.vehicle",
     "save_onnx": "flytune.export.onnx",
     "save_policy": "flytune.control.policy",
-    "train": "flytune.learn.run",
-    "write_comparison": "flytune.show.comparison",
-    "write_report": "flytune.show.report",
+    "train": "flytune.training.loop",
+    "write_comparison": "flytune.report.comparison",
+    "write_report": "flytune.report.report",
     "write_task": "flytune.task.task",
 }
 
@@ -72,9 +72,9 @@ __all__ = [
     "Run",
     "Task",
     "Vehicle",
-    "classical_pilot",
+    "classical_controller",
     "compare",
-    "find_pilot",
+    "find_controller",
     "fly",
     "judge",
     "load_onnx",

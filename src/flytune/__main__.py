@@ -2,6 +2,6 @@
 
 import sys
 
-from flytune.cli import main
+from flytune.cli.main import main
 
 sys.exit(main())

@@ -38,26 +38,26 @@ def observation():
 
 @pytest.fixture(scope="session")
 def calm_flight():
-    """States [N, T, 3 or 4] of noise-free flights of a pilot from rest at positions [N, 3] and angles [N, 3]."""
+    """States [N, T, 3 or 4] of noise-free flights of a controller from rest at positions [N, 3] and angles [N, 3]."""
 
     @partial(jax.jit, static_argnames="steps")
-    def fly(pilot, task, positions, angles, steps):
+    def fly(controller, task, positions, angles, steps):
         def one(position, angle):
             def advance(carry, _):
                 state, last, memory = carry
-                memory, action = pilot.act(memory, observe(task.target, task.noise, state, last, jnp.zeros(13)))
+                memory, action = controller.act(memory, observe(task.target, task.noise, state, last, jnp.zeros(13)))
                 state = dynamics.step(task.vehicle, state, action)
                 return (state, action, memory), (state, action)
 
             start = dynamics.hovering(task.vehicle, tuple(position), rotation.from_euler(*angle))
-            return jax.lax.scan(advance, (start, jnp.zeros(4), pilot.initial_memory()), None, length=steps)[1]
+            return jax.lax.scan(advance, (start, jnp.zeros(4), controller.initial_memory()), None, length=steps)[1]
 
         return jax.vmap(one)(positions, angles)
 
-    def run(pilot, task, positions, angles=None, steps=800):
+    def run(controller, task, positions, angles=None, steps=800):
         positions = jnp.atleast_2d(jnp.asarray(positions, float))
         angles = jnp.zeros_like(positions) if angles is None else jnp.atleast_2d(jnp.asarray(angles, float))
-        states, actions = fly(pilot, task, positions, angles, steps)
+        states, actions = fly(controller, task, positions, angles, steps)
         parts = ("position", "attitude", "velocity", "body_rate")
         return {name: np.stack(getattr(states, name), axis=-1) for name in parts} | {"action": np.asarray(actions)}
 

@@ -1,4 +1,4 @@
-"""What every classical pilot must do: rest at the target, reach it, keep its limits, and read its gains."""
+"""What every classical controller must do: rest at the target, reach it, keep its limits, and read its gains."""
 
 import math
 
@@ -9,10 +9,10 @@ import pytest
 import tomlkit
 
 import flytune
-from flytune.control.classical import CLASSICAL, classical_pilot, read_gains
+from flytune.config.document import plain
+from flytune.control.classical import CLASSICAL, classical_controller, read_gains
 from flytune.control.controller import Controller
 from flytune.control.sensing import heading
-from flytune.document import plain
 from flytune.errors import BadInput
 from flytune.physics.rotation import from_euler
 from flytune.task.task import load_task
@@ -22,23 +22,23 @@ EVERY = [(name, gains) for name in CLASSICAL for gains in SETS]
 
 
 @pytest.fixture(params=EVERY, ids="-".join)
-def pilot(request, baseline):
-    """Every pilot with either set of gains, for the baseline."""
-    return classical_pilot(request.param[0], baseline, request.param[1])
+def controller(request, baseline):
+    """Every controller with either set of gains, for the baseline."""
+    return classical_controller(request.param[0], baseline, request.param[1])
 
 
 @jax.jit
-def first_action(pilot, seen):
-    """What a pilot does about its first observation."""
-    return pilot.act(pilot.initial_memory(), seen)[1]
+def first_action(controller, seen):
+    """What a controller does about its first observation."""
+    return controller.act(controller.initial_memory(), seen)[1]
 
 
 # --- at the target ---
 
 
-def test_at_the_target_the_action_is_hover(pilot, baseline, observation):
-    assert isinstance(pilot, Controller)
-    action = first_action(pilot, observation(baseline))
+def test_at_the_target_the_action_is_hover(controller, baseline, observation):
+    assert isinstance(controller, Controller)
+    action = first_action(controller, observation(baseline))
     # float32: the allocation's squares carry 1e-7, and attitude errors of 1e-7 times gains of 1e3
     np.testing.assert_allclose(action, 0, atol=1e-4)
 
@@ -47,8 +47,8 @@ def test_at_the_target_the_action_is_hover(pilot, baseline, observation):
 @pytest.mark.parametrize("name", CLASSICAL)
 def test_at_a_target_with_a_heading_the_action_is_hover(name, yaw, observation):
     task = load_task("baseline", {"target.yaw": yaw})
-    pilot = classical_pilot(name, task)
-    action = first_action(pilot, observation(task, angles=(0, 0, yaw)))
+    controller = classical_controller(name, task)
+    action = first_action(controller, observation(task, angles=(0, 0, yaw)))
     np.testing.assert_allclose(action, 0, atol=2e-4)
 
 
@@ -63,8 +63,8 @@ def test_at_a_target_with_a_heading_the_action_is_hover(name, yaw, observation):
         ({"body_rate": (0, -1, 0)}, (-1, 1, 1, -1)),
     ],
 )
-def test_the_action_works_against_the_error(pilot, baseline, observation, moved, signs):
-    action = first_action(pilot, observation(baseline, **moved))
+def test_the_action_works_against_the_error(controller, baseline, observation, moved, signs):
+    action = first_action(controller, observation(baseline, **moved))
     assert np.all(np.sign(action) == signs), action
 
 
@@ -73,7 +73,7 @@ def test_the_action_works_against_the_error(pilot, baseline, observation, moved,
 
 @pytest.mark.parametrize(("name", "gains"), EVERY)
 def test_every_start_ends_at_the_target(name, gains, baseline):
-    flights = flytune.fly(classical_pilot(name, baseline, gains), baseline, trials=20, seed=3)
+    flights = flytune.fly(classical_controller(name, baseline, gains), baseline, trials=20, seed=3)
     distance = np.linalg.norm(flights.position[:, -1] - flights.target_position, axis=-1)
     assert not flights.crashed.any() and distance.max() < 0.02
     turned = np.abs(np.asarray(heading(tuple(jnp.moveaxis(jnp.asarray(flights.attitude[:, -1]), -1, 0)))))
@@ -83,7 +83,7 @@ def test_every_start_ends_at_the_target(name, gains, baseline):
 @pytest.mark.parametrize(("name", "gains"), EVERY)
 def test_the_same_gains_fly_a_vehicle_whose_motors_lag(name, gains):
     task = load_task("baseline", {"vehicle": "crazyflie-measured"})
-    flights = flytune.fly(classical_pilot(name, task, gains), task, trials=20, seed=3)
+    flights = flytune.fly(classical_controller(name, task, gains), task, trials=20, seed=3)
     distance = np.linalg.norm(flights.position[:, -1] - flights.target_position, axis=-1)
     assert not flights.crashed.any() and distance.max() < 0.1
 
@@ -92,9 +92,9 @@ def test_the_same_gains_fly_a_vehicle_whose_motors_lag(name, gains):
 @pytest.mark.parametrize("name", CLASSICAL)
 def test_a_pilot_keeps_the_tasks_speed_bound_from_rest_and_level(name, bound, calm_flight):
     task = load_task("baseline", {"termination.speed.bound": bound})
-    pilot = classical_pilot(name, task)
-    starts = [[2, 2, 2], [-2, 1, 0.1], [0.3, -2, 1.5], [0, 0, 2]]
-    speed = np.linalg.norm(calm_flight(pilot, task, starts)["velocity"], axis=-1).max()
+    controller = classical_controller(name, task)
+    initial_conditions = [[2, 2, 2], [-2, 1, 0.1], [0.3, -2, 1.5], [0, 0, 2]]
+    speed = np.linalg.norm(calm_flight(controller, task, initial_conditions)["velocity"], axis=-1).max()
     assert speed < bound
     assert speed > 0.5 * min(bound, 1.2)  # and uses it, where the way is long enough
 
@@ -103,9 +103,9 @@ def test_a_pilot_keeps_the_tasks_speed_bound_from_rest_and_level(name, bound, ca
 def test_without_a_speed_bound_a_pilot_flies_faster(name, calm_flight, baseline):
     table = plain(baseline)
     del table["termination"]["speed"]
-    free = flytune.document.read(type(baseline), table)
-    assert classical_pilot(name, free).speed_limit is None
-    states = calm_flight(classical_pilot(name, free), free, [[2, 2, 2]])
+    free = flytune.config.document.read(type(baseline), table)
+    assert classical_controller(name, free).speed_limit is None
+    states = calm_flight(classical_controller(name, free), free, [[2, 2, 2]])
     assert np.linalg.norm(states["velocity"], axis=-1).max() > 1.2
     np.testing.assert_allclose(states["position"][0, -1], [0, 0, 1], atol=0.02)
 
@@ -117,9 +117,9 @@ def test_a_world_turned_about_the_vertical_is_flown_the_same(name, baseline, cal
     turned_task = load_task("baseline", {"target.yaw": turn})
     start, yaw = np.array([1.2, -0.7, 1.4]), 0.9
     turned_start = [c * start[0] - s * start[1], s * start[0] + c * start[1], start[2]]
-    one = calm_flight(classical_pilot(name, baseline), baseline, start, [0.1, -0.1, yaw], steps=400)
+    one = calm_flight(classical_controller(name, baseline), baseline, start, [0.1, -0.1, yaw], steps=400)
     other = calm_flight(
-        classical_pilot(name, turned_task), turned_task, turned_start, [0.1, -0.1, yaw + turn], steps=400
+        classical_controller(name, turned_task), turned_task, turned_start, [0.1, -0.1, yaw + turn], steps=400
     )
     x, y, z = np.moveaxis(one["position"][0], -1, 0)
     # float32 rounding of 1e-7, amplified by attitude loops and integrated over 4 s
@@ -128,7 +128,7 @@ def test_a_world_turned_about_the_vertical_is_flown_the_same(name, baseline, cal
 
 @pytest.mark.parametrize("name", CLASSICAL)
 def test_compiled_and_batched_a_pilot_answers_as_alone(name, baseline, observation):
-    pilot = classical_pilot(name, baseline)
+    controller = classical_controller(name, baseline)
     rng = np.random.default_rng(0)
     seen = jnp.stack(
         [
@@ -136,7 +136,7 @@ def test_compiled_and_batched_a_pilot_answers_as_alone(name, baseline, observati
             for _ in range(4)
         ]
     )
-    act = lambda one: pilot.act(pilot.initial_memory(), one)[1]  # noqa: E731
+    act = lambda one: controller.act(controller.initial_memory(), one)[1]  # noqa: E731
     alone = np.stack([act(one) for one in seen])
     # float32: other orders of summation, 1e-7 of squares that the action's range holds a few times
     np.testing.assert_allclose(jax.jit(act)(seen[0]), alone[0], atol=2e-5)
@@ -147,13 +147,13 @@ def test_other_gains_do_not_compile_another_program(baseline, observation):
     seen, count = observation(baseline), []
 
     @jax.jit
-    def act(pilot, one):
+    def act(controller, one):
         count.append(1)
-        return pilot.act(pilot.initial_memory(), one)[1]
+        return controller.act(controller.initial_memory(), one)[1]
 
     for name in CLASSICAL:
         for gains in SETS:
-            act(classical_pilot(name, baseline, gains), seen)
+            act(classical_controller(name, baseline, gains), seen)
     assert len(count) == len(CLASSICAL)
 
 
@@ -162,12 +162,12 @@ def test_other_gains_do_not_compile_another_program(baseline, observation):
 
 def test_an_unknown_pilot_is_refused_with_the_list(baseline):
     with pytest.raises(BadInput, match=r"^pdi: .*Allowed: geometric, lqr, pid\. Did you mean pid\?$"):
-        classical_pilot("pdi", baseline)
+        classical_controller("pdi", baseline)
 
 
 def test_an_unknown_set_of_gains_is_refused_with_the_list(baseline):
     with pytest.raises(BadInput, match=r"^gains: 'best' is not allowed. Allowed: tuned, textbook\.$"):
-        classical_pilot("pid", baseline, "best")
+        classical_controller("pid", baseline, "best")
 
 
 @pytest.mark.parametrize("name", CLASSICAL)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from flytune.control.actuation import PITCH, ROLL, hovering_rotors
-from flytune.control.classical import classical_pilot, read_gains
+from flytune.control.classical import classical_controller, read_gains
 from flytune.control.lqr import feedback, linearised, weights
 from flytune.control.sensing import sense
 from flytune.physics.vehicle import load_vehicle, vehicle_names
@@ -88,20 +88,20 @@ def test_weights_are_bryson_s(vehicle):
 def test_the_deviation_is_seen_along_the_heading(observation):
     # heading a quarter turn to the left: an error along +y is an error ahead
     task = load_task("baseline", {"target.yaw": 1.5})
-    pilot = classical_pilot("lqr", task, "textbook")
+    controller = classical_controller("lqr", task, "textbook")
     yaw = math.pi / 2
     seen = observation(task, position=(0, 0.01, 1), velocity=(0.02, 0, 0), angles=(0.01, 0.02, yaw))
-    x = np.stack(pilot.deviation(sense(1.5, seen), hovering_rotors(task.vehicle)))
+    x = np.stack(controller.deviation(sense(1.5, seen), hovering_rotors(task.vehicle)))
     wanted = [0.01, 0, 0, 0, -0.02, 0, 0.01, 0.02, yaw - 1.5, 0, 0, 0, 0, 0, 0, 0]
     np.testing.assert_allclose(x, wanted, atol=1.5e-4)  # small angles: a quaternion's part is half of it, to 2e-4 / 24
 
 
 def test_the_position_error_is_cut_to_what_the_limits_allow(baseline):
-    pilot = classical_pilot("lqr", baseline, "textbook")
-    far = np.stack(pilot.reachable(tuple(map(jnp.float32, (30.0, 0.0, 0.0)))))
-    pitch = np.array(PITCH) @ np.asarray(pilot.gain)
+    controller = classical_controller("lqr", baseline, "textbook")
+    far = np.stack(controller.reachable(tuple(map(jnp.float32, (30.0, 0.0, 0.0)))))
+    pitch = np.array(PITCH) @ np.asarray(controller.gain)
     cruise = pitch[0] / pitch[3] * far[0]  # the speed at which position and velocity cancel
-    np.testing.assert_allclose(cruise, pilot.speed_limit, rtol=1e-4)
-    assert abs(pitch[0] / pitch[7] * far[0]) <= pilot.tilt_limit
+    np.testing.assert_allclose(cruise, controller.speed_limit, rtol=1e-4)
+    assert abs(pitch[0] / pitch[7] * far[0]) <= controller.tilt_limit
     near = tuple(map(jnp.float32, (0.01, -0.02, 0.03)))
-    np.testing.assert_array_equal(np.stack(pilot.reachable(near)), np.stack(near))
+    np.testing.assert_array_equal(np.stack(controller.reachable(near)), np.stack(near))

@@ -8,10 +8,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from flytune.control.classical import classical_pilot, pilot_with, read_gains
+from flytune.config.pytree import pytree
+from flytune.control.classical import classical_controller, controller_with, read_gains
 from flytune.control.sensing import sense
 from flytune.control.steering import slowed, specific_force
-from flytune.pytree import pytree
 
 
 @pytest.fixture(scope="module")
@@ -38,7 +38,7 @@ def gains():
 @pytest.fixture(scope="module")
 def pid(baseline, gains):
     """The PID with these gains, limited to the baseline's 0.8 m/s."""
-    return pilot_with(gains, baseline)
+    return controller_with(gains, baseline)
 
 
 def seen(observation, task, **state):
@@ -75,16 +75,16 @@ def test_the_integral_stops_at_its_limit(pid, baseline, observation):
 
 @pytree
 class Tired:
-    """A pilot whose motors do a little less than they are told."""
+    """A controller whose motors do a little less than they are told."""
 
-    pilot: Any
+    controller: Any
     lost: float  # of each action
 
     def initial_memory(self):
-        return self.pilot.initial_memory()
+        return self.controller.initial_memory()
 
     def act(self, memory, observation):
-        memory, action = self.pilot.act(memory, observation)
+        memory, action = self.controller.act(memory, observation)
         return memory, action - self.lost
 
 
@@ -92,11 +92,11 @@ def test_the_integral_removes_a_constant_pull(baseline, calm_flight):
     # an action lower by 0.01 takes 1 - (1 - 0.5 * 0.01)^2 = 0.9975 % off the thrust, 0.0979 m/s^2.
     # Without an integral the vehicle hangs 0.0979 / (k_p k_v) = 0.0979 / 4 = 24.5 mm low; with one, that fades at
     # k_i / (k_p k_v) = 0.1 1/s
-    pilot = classical_pilot("pid", baseline, "textbook")
-    without = dataclasses.replace(pilot, gains=dataclasses.replace(pilot.gains, position_integral=0.0))
+    controller = classical_controller("pid", baseline, "textbook")
+    without = dataclasses.replace(controller, gains=dataclasses.replace(controller.gains, position_integral=0.0))
     low, kept = (
-        1 - calm_flight(Tired(pilot=one, lost=0.01), baseline, [0, 0, 1], steps=4000)["position"][0, -1, 2]
-        for one in (without, pilot)
+        1 - calm_flight(Tired(controller=one, lost=0.01), baseline, [0, 0, 1], steps=4000)["position"][0, -1, 2]
+        for one in (without, controller)
     )
     np.testing.assert_allclose(low, 0.0245, rtol=0.01)
     assert abs(kept) < 0.0245 * math.exp(-0.1 * 40) * 1.5  # half as much again for the slightly slower true pole

@@ -13,7 +13,7 @@ import pytest
 from flytune.control.controller import Controller
 from flytune.control.policy import ACTION, Network, Policy, make_network
 from flytune.errors import BadInput
-from flytune.response.fly import fly
+from flytune.evaluation.fly import fly
 from flytune.task.observation import LAYOUT, SIZE
 from flytune.task.task import load_task, preset_names, read_task_text, write_task
 
@@ -21,8 +21,8 @@ onnx = pytest.importorskip("onnx", reason="needs flytune[onnx]")
 onnxruntime = pytest.importorskip("onnxruntime", reason="needs flytune[onnx]")
 
 from flytune.export import onnx as export  # noqa: E402
-from flytune.export.onnx import CONVENTIONS, OnnxPilot, load_onnx, rounding_bound, save_onnx  # noqa: E402
-from flytune.export.onnx_session import sample_observations  # noqa: E402
+from flytune.export.onnx import CONVENTIONS, OnnxController, load_onnx, rounding_bound, save_onnx  # noqa: E402
+from flytune.export.untrusted.onnx_session import sample_observations  # noqa: E402
 
 
 def make_policy(hidden=(64, 64), squash="tanh", gain=0.5, about=None, seed=0):
@@ -147,16 +147,16 @@ def test_the_task_of_every_preset_survives_the_file(name, tmp_path):
 
 
 def test_a_pilot_from_the_file_is_a_controller_alone_and_in_any_batch(policy, exported):
-    pilot = load_onnx(exported)
-    assert isinstance(pilot, Controller) and isinstance(pilot, OnnxPilot)
+    controller = load_onnx(exported)
+    assert isinstance(controller, Controller) and isinstance(controller, OnnxController)
     observations = jnp.asarray(sample_observations(6))
     expected, allowed = policy(observations), 2 * rounding_bound(policy, np.asarray(observations)).max()
-    memory, action = pilot.act(pilot.initial_memory(), observations[2])
+    memory, action = controller.act(controller.initial_memory(), observations[2])
     assert memory == () and action.shape == (4,) and action.dtype == jnp.float32
     np.testing.assert_allclose(action, expected[2], atol=allowed)
 
     def act(observation):
-        return pilot.act((), observation)[1]
+        return controller.act((), observation)[1]
 
     np.testing.assert_allclose(jax.jit(jax.vmap(act))(observations), expected, atol=allowed)
     twice = jax.vmap(jax.vmap(act))(observations.reshape(2, 3, 17))
@@ -180,9 +180,9 @@ def test_it_flies_the_flights_of_the_policy_it_was_made_from(policy, exported, t
 
 
 def test_a_run_that_fails_in_flight_gives_an_action_that_is_not_finite(exported):
-    pilot = load_onnx(exported)
-    assert np.all(np.isnan(pilot._answer(np.zeros((2, 16), np.float32))))  # one number short
-    assert pilot._answer(np.zeros((2, 16), np.float32)).shape == (2, 4)
+    controller = load_onnx(exported)
+    assert np.all(np.isnan(controller._answer(np.zeros((2, 16), np.float32))))  # one number short
+    assert controller._answer(np.zeros((2, 16), np.float32)).shape == (2, 4)
 
 
 def test_the_conventions_are_those_of_the_contract():

@@ -9,7 +9,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from flytune.errors import BadInput
-from flytune.response.fly import fly
+from flytune.evaluation.fly import fly
 from flytune.task.task import load_task
 
 onnx = pytest.importorskip("onnx", reason="needs flytune[onnx]")
@@ -17,9 +17,9 @@ pytest.importorskip("onnxruntime", reason="needs flytune[onnx]")
 
 from onnx import TensorProto, helper, numpy_helper  # noqa: E402
 
-from flytune.export.onnx import CONVENTIONS, OnnxPilot, load_onnx  # noqa: E402
-from flytune.export.onnx_pilot import read_onnx  # noqa: E402
-from flytune.export.onnx_session import sample_observations  # noqa: E402
+from flytune.export.onnx import CONVENTIONS, OnnxController, load_onnx  # noqa: E402
+from flytune.export.untrusted.onnx_controller import read_onnx  # noqa: E402
+from flytune.export.untrusted.onnx_session import sample_observations  # noqa: E402
 
 RANDOM = np.random.default_rng(7)
 FIRST = 0.1 * RANDOM.standard_normal((8, 17)).astype(np.float32)
@@ -74,27 +74,27 @@ def refusal(content):
 
 def test_a_model_of_another_make_flies_when_it_keeps_to_the_contract(tmp_path):
     onnx.save(make_model(), tmp_path / "theirs.onnx")
-    pilot = load_onnx(tmp_path / "theirs.onnx")
+    controller = load_onnx(tmp_path / "theirs.onnx")
     observation = sample_observations(50)[7]
     expected = np.tanh(np.maximum(observation @ FIRST.T + BIAS, 0) @ SECOND.T)
-    np.testing.assert_allclose(pilot.act((), jax.numpy.asarray(observation))[1], expected, atol=1e-6)
-    flights = fly(pilot, load_task("baseline"), trials=3, duration=0.6)
+    np.testing.assert_allclose(controller.act((), jax.numpy.asarray(observation))[1], expected, atol=1e-6)
+    flights = fly(controller, load_task("baseline"), trials=3, duration=0.6)
     assert np.all(np.isfinite(flights.action)) and np.abs(flights.action[:, 1:]).min() > 0
 
 
 def test_weights_listed_among_the_inputs_and_unused_operator_sets_do_no_harm():
     inputs = [value("observation", [None, 17]), value("first", [8, 17])]
     model = make_model(inputs=inputs, opsets=("", "some.exporter"))
-    assert isinstance(read_onnx(model.SerializeToString(), "p.onnx"), OnnxPilot)
+    assert isinstance(read_onnx(model.SerializeToString(), "p.onnx"), OnnxController)
 
 
 def test_actions_a_rounding_beyond_one_are_brought_back_into_the_box():
     saturated = (*LAYERS[:3], helper.make_node("Tanh", ["raw"], ["t"]), helper.make_node("Mul", ["t", "k"], ["action"]))
     model = make_model(saturated, second=1000 * SECOND, k=np.float32(1 + 1e-6))
-    pilot = read_onnx(model.SerializeToString(), "p.onnx")
+    controller = read_onnx(model.SerializeToString(), "p.onnx")
     observations = sample_observations(64)
-    assert np.abs(pilot.session(observations)).max() > 1
-    assert np.abs(jax.vmap(lambda o: pilot.act((), o)[1])(observations)).max() == 1
+    assert np.abs(controller.session(observations)).max() > 1
+    assert np.abs(jax.vmap(lambda o: controller.act((), o)[1])(observations)).max() == 1
 
 
 # --- files ---
@@ -282,7 +282,7 @@ def test_tensors_that_hold_no_numbers_or_less_than_their_shape_says_are_refused(
 def good():
     """The bytes of a small model that flies."""
     content = make_model(facts=CONVENTIONS | {"task": "baseline"}).SerializeToString()
-    assert isinstance(read_onnx(content, "p.onnx"), OnnxPilot)
+    assert isinstance(read_onnx(content, "p.onnx"), OnnxController)
     return content
 
 
@@ -297,12 +297,12 @@ def test_a_file_damaged_anywhere_is_a_pilot_that_answers_or_one_line(good, data)
         content[position] ^= data.draw(st.integers(1, 255))
     cut = data.draw(st.sampled_from([len(content), data.draw(st.integers(0, len(content)))]))
     try:
-        pilot = read_onnx(bytes(content[:cut]), "p.onnx")
+        controller = read_onnx(bytes(content[:cut]), "p.onnx")
     except BadInput as refused:
         lines = str(refused).splitlines()
     else:
-        lines = ["a pilot"]
-        assert all(isinstance(text, str) for text in pilot.about.values())
-        actions = pilot.session(sample_observations(20))
+        lines = ["a controller"]
+        assert all(isinstance(text, str) for text in controller.about.values())
+        actions = controller.session(sample_observations(20))
         assert actions.shape == (20, 4) and np.all(np.isfinite(actions))
     assert len(lines) == 1

@@ -99,7 +99,7 @@ def test_the_error_falls_with_the_fourth_power_of_the_step_in_double_precision(f
         assert math.log2(middle[name] / fine[name]) == pytest.approx(4, abs=0.25), name
 
 
-# R8: what the pilot's sensors do not resolve
+# R8: what the controller's sensors do not resolve
 NOISE = {"position": 1e-3, "attitude": 2e-3, "velocity": 1e-3, "body_rate": 2e-3}
 
 

@@ -5,7 +5,7 @@ import math
 
 import pytest
 
-from flytune import document
+from flytune.config import document
 from flytune.errors import BadInput
 from flytune.physics.vehicle import Vehicle, load_vehicle, vehicle_names, vehicle_table
 

@@ -16,8 +16,8 @@ from stable_baselines3.common import buffers
 from stable_baselines3.common.callbacks import BaseCallback
 
 from flytune.control.policy import Network
-from flytune.learn import ppo, sb3
 from flytune.task.task import load_task
+from flytune.training import ppo, sb3
 
 KEY = jax.random.key(3)
 

@@ -13,15 +13,15 @@ import jax
 import numpy as np
 import torch
 
-from flytune.bridges.sb3 import HoverVecEnv
+from flytune.adapters.vec_env import HoverVecEnv
 from flytune.control.policy import load_policy
 from flytune.errors import BadInput, Diverged
-from flytune.export.sb3_model import actor_network
-from flytune.learn import sb3
-from flytune.learn.directory import RunDirectory
-from flytune.learn.run import _row, total_updates, train, with_steps
+from flytune.export.untrusted.sb3_model import actor_network
+from flytune.runs.directory import RunDirectory
 from flytune.task.task import load_task, write_task
 from flytune.task.termination import causes
+from flytune.training import sb3
+from flytune.training.loop import _row, total_updates, train, with_steps
 
 SMALL = {
     "ppo.environments": 4,
@@ -84,12 +84,12 @@ def test_the_same_seed_gives_the_same_policy_bit_by_bit_and_another_seed_another
 @pytest.mark.parametrize("done", [1, 3])
 def test_an_interrupted_run_goes_on_to_the_same_result_bit_by_bit(task, whole, tmp_path, done):
     directory = RunDirectory(tmp_path / "run", task, "sb3", 1, resume=False)
-    learner, rows = sb3.start(task, task.ppo, jax.random.key(1)), []
+    train_state, rows = sb3.start(task, task.ppo, jax.random.key(1)), []
     for number in range(1, done + 1):
-        learner, seen = sb3.update(task, task.ppo, learner)
+        train_state, seen = sb3.update(task, task.ppo, train_state)
         rows.append(_row(seen, causes(task.termination), number, 64 * number, 0.0))
-    directory.checkpoint(learner, rows)
-    del learner
+    directory.checkpoint(train_state, rows)
+    del train_state
     torch.manual_seed(99), np.random.seed(99)  # noqa: NPY002  # another process begins with other random numbers
     resumed = train(task, "sb3", seed=1, out=tmp_path / "run", resume=True)
     assert_identical(whole.policy, resumed.policy)
@@ -107,10 +107,10 @@ def test_the_trainer_is_stable_baselines3s_own_training_bit_by_bit(task, whole):
 
 
 def test_a_learner_can_be_moved_on_twice_and_gives_the_same(task):
-    learner = sb3.start(task, task.ppo, jax.random.key(5))
-    first, _ = sb3.update(task, task.ppo, learner)
+    train_state = sb3.start(task, task.ppo, jax.random.key(5))
+    first, _ = sb3.update(task, task.ppo, train_state)
     sb3.update(task, task.ppo, first)  # leaves the workbench elsewhere
-    again, _ = sb3.update(task, task.ppo, learner)
+    again, _ = sb3.update(task, task.ppo, train_state)
     assert_identical(first, again)
 
 
@@ -147,7 +147,7 @@ def test_a_missing_package_is_named_with_its_remedy_before_anything_is_written(t
     script = (
         f"import sys; sys.modules[{package!r}] = None\n"
         "from flytune.errors import BadInput\n"
-        "from flytune.learn.run import train\n"
+        "from flytune.training.loop import train\n"
         "from flytune.task.task import load_task\n"
         "from pathlib import Path\n"
         "try: train(load_task('baseline'), 'sb3', out=Path(sys.argv[1]))\n"

@@ -17,7 +17,7 @@ from stable_baselines3 import A2C, PPO, SAC
 
 from flytune.control.policy import load_policy, save_policy
 from flytune.errors import BadInput
-from flytune.export.sb3_model import load_sb3
+from flytune.export.untrusted.sb3_model import load_sb3
 
 OBSERVATIONS = np.random.default_rng(1).normal(size=(10_000, 17)).astype(np.float32)
 

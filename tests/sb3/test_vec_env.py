@@ -14,7 +14,7 @@ from stable_baselines3.common.logger import configure
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import VecCheckNan, VecMonitor, VecNormalize
 
-from flytune.bridges.sb3 import HoverVecEnv
+from flytune.adapters.vec_env import HoverVecEnv
 from flytune.task.task import load_task
 
 NUMBER, HORIZON = 6, 12

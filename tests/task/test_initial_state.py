@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from flytune import document
+from flytune.config import document
 from flytune.errors import BadInput
 from flytune.physics.vehicle import load_vehicle
-from flytune.task.initial_state import EVALUATION_STARTS, InitialState
+from flytune.task.initial_state import EVALUATION_INITIAL_STATES, InitialState
 
 DRAW = jax.jit(lambda where, vehicle, keys: jax.vmap(lambda key: where.draw(vehicle, key))(keys))
 NUMBER = 20_000
@@ -34,7 +34,7 @@ CASES = {  # where, lowest and highest position, largest tilt in rad
 @pytest.fixture(scope="module", params=CASES)
 def case(request, tasks):
     """Of one distribution: its bounds and many draws."""
-    where = tasks["baseline"].initial_state if request.param == "training" else EVALUATION_STARTS[request.param]
+    where = tasks["baseline"].initial_state if request.param == "training" else EVALUATION_INITIAL_STATES[request.param]
     return CASES[request.param], *draw(where)
 
 
@@ -73,8 +73,8 @@ def test_a_start_is_at_rest_with_its_rotors_at_hover_speed(case):
 
 def test_five_percent_of_the_papers_starts_lie_below_the_altitude_bound():
     # C3: 0.1 m of 2 m; 20,000 draws know that share to 0.15 %
-    assert np.mean(draw(EVALUATION_STARTS["paper"])[0][:, 2] < 0.1) == pytest.approx(0.05, abs=0.008)
-    assert np.mean(draw(EVALUATION_STARTS["clear"])[0][:, 2] < 0.1) == 0
+    assert np.mean(draw(EVALUATION_INITIAL_STATES["paper"])[0][:, 2] < 0.1) == pytest.approx(0.05, abs=0.008)
+    assert np.mean(draw(EVALUATION_INITIAL_STATES["clear"])[0][:, 2] < 0.1) == 0
 
 
 def test_every_preset_trains_from_the_same_starts(tasks):
@@ -101,5 +101,5 @@ def test_a_box_without_size_is_one_place():
 
 def test_a_vehicle_with_latency_starts_with_nothing_on_its_way():
     late = dataclasses.replace(load_vehicle("crazyflie"), action_latency_steps=3)
-    start = EVALUATION_STARTS["clear"].draw(late, jax.random.key(1))
+    start = EVALUATION_INITIAL_STATES["clear"].draw(late, jax.random.key(1))
     assert start.pending_actions.shape == (3, 4) and not start.pending_actions.any()

@@ -1,4 +1,4 @@
-"""The 17 numbers a pilot sees, and their noise (paper R7, R8)."""
+"""The 17 numbers a controller sees, and their noise (paper R7, R8)."""
 
 import dataclasses
 import math

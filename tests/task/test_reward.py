@@ -135,7 +135,7 @@ def test_each_error_is_the_one_it_names(situation, of, expected):
 
 
 def test_the_gradient_of_every_preset_is_finite_at_its_target(tasks, situation, total):
-    # the square root in theta = 2 atan2(|vec q|, w) must not give NaN where the pilot wants to be
+    # the square root in theta = 2 atan2(|vec q|, w) must not give NaN where the controller wants to be
     for task in tasks.values():
         gradient = jax.grad(total, argnums=1)(task.reward, situation())
         assert all(jnp.isfinite(leaf).all() for leaf in jax.tree.leaves(gradient))

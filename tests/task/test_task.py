@@ -6,8 +6,8 @@ import math
 import jax
 import pytest
 
-from flytune import document
-from flytune.document import source_of
+from flytune.config import document
+from flytune.config.document import source_of
 from flytune.errors import BadInput
 from flytune.physics.vehicle import load_vehicle, vehicle_names
 from flytune.task.reward import DualExponential, Exponential, Smoothness, Survival
@@ -89,7 +89,7 @@ def test_a_preset_is_learned_with_the_papers_settings(tasks, preset):
     assert (ppo.steps, ppo.hidden) == (6_000_000, (64, 64))  # R18, R16
     assert ppo.environments * ppo.rollout == 4 * 4096  # the samples of R18
     # Stable-Baselines3's defaults
-    assert (ppo.discount, ppo.gae_lambda, ppo.value_weight, ppo.gradient_norm) == (0.99, 0.95, 0.5, 0.5)
+    assert (ppo.discount, ppo.gae_lambda, ppo.value_weight, ppo.max_grad_norm) == (0.99, 0.95, 0.5, 0.5)
     assert (ppo.entropy_weight, ppo.initial_log_std) == (0.0, 0.0)
 
 

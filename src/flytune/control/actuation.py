@@ -16,7 +16,7 @@ YAW = (-1, 1, -1, 1)
 
 
 def hovering_rotors(vehicle: Vehicle) -> Components:
-    """Four rotors at hover speed, in rpm: what a pilot believes before its first observation."""
+    """Four rotors at hover speed, in rpm: what a controller believes before its first observation."""
     return tuple(jnp.full(4, vehicle.hover_rotor_speed_rpm, float))
 
 

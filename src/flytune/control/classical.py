@@ -1,18 +1,18 @@
-"""Classical pilots by name, their gains read from gains/NAME.toml: two sets each, textbook and tuned."""
+"""Classical controllers by name, their gains read from gains/NAME.toml: two sets each, textbook and tuned."""
 
 import math
 from importlib import resources
 from pathlib import Path
 from typing import Any
 
-from flytune import document
+from flytune.config import document
+from flytune.config.pytree import label, pytree
 from flytune.control.controller import Controller
 from flytune.control.geometric import Geometric, GeometricGains
 from flytune.control.lqr import LqrGains, make_lqr
 from flytune.control.pid import Pid, PidGains
 from flytune.control.steering import tighter
 from flytune.errors import BadInput
-from flytune.pytree import label, pytree
 from flytune.task.task import Task
 from flytune.task.termination import MaximumBodyRate, MaximumTilt
 
@@ -51,33 +51,33 @@ FILES: dict[str, Any] = {"geometric": GeometricFile, "lqr": LqrFile, "pid": PidF
 CLASSICAL = tuple(FILES)
 
 
-def classical_pilot(name: str, task: Task, gains: str = "tuned") -> Controller:
-    """The classical pilot of a name for a task's vehicle, target heading and bounds.
+def classical_controller(name: str, task: Task, gains: str = "tuned") -> Controller:
+    """The classical controller of a name for a task's vehicle, target heading and bounds.
 
     Args:
         name: `pid`, `geometric` or `lqr`.
-        task: what it will fly. Its bounds on speed, tilt and body rate become the pilot's limits, less the margin
+        task: what it will fly. Its bounds on speed, tilt and body rate become the controller's limits, less the margin
             that the gains leave; a bound the task does not have limits nothing.
         gains: `tuned` or `textbook`.
 
     Raises:
-        BadInput: no such pilot or gains.
+        BadInput: no such controller or gains.
     """
     if gains not in SETS:
         raise BadInput(f"gains: {gains!r} is not allowed. Allowed: {', '.join(SETS)}.")
-    return pilot_with(getattr(read_gains(name), gains), task)
+    return controller_with(getattr(read_gains(name), gains), task)
 
 
 def read_gains(name: str, path: Path | None = None) -> PidFile | GeometricFile | LqrFile:
-    """Both sets of gains of a pilot, from a file or, where None, from the one that ships.
+    """Both sets of gains of a controller, from a file or, where None, from the one that ships.
 
     Raises:
-        BadInput: no such pilot, or not its gains; one line that names the field.
+        BadInput: no such controller, or not its gains; one line that names the field.
     """
     if name not in FILES:
         hint = document.nearest(name, list(CLASSICAL))
         raise BadInput(
-            f"{name}: no such classical pilot. Allowed: {', '.join(CLASSICAL)}."
+            f"{name}: no such classical controller. Allowed: {', '.join(CLASSICAL)}."
             + (f" Did you mean {hint}?" if hint else "")
         )
     if path is not None:
@@ -86,8 +86,8 @@ def read_gains(name: str, path: Path | None = None) -> PidFile | GeometricFile |
         return document.read(FILES[name], document.load(shipped), f"gains/{name}.toml")
 
 
-def pilot_with(gains: AnyGains, task: Task) -> Controller:
-    """The pilot whose gains these are, for a task.
+def controller_with(gains: AnyGains, task: Task) -> Controller:
+    """The controller whose gains these are, for a task.
 
     Raises:
         BadInput: the gains give no stabilising feedback.

@@ -1,4 +1,4 @@
-"""The protocol every pilot keeps, learned or classical."""
+"""The protocol every controller keeps, learned or classical."""
 
 from typing import Any, Protocol, runtime_checkable
 
@@ -7,10 +7,10 @@ from jaxtyping import Array, Float
 
 @runtime_checkable
 class Controller(Protocol):
-    """A pilot: a JAX pytree that turns observations into actions, and may remember something in between."""
+    """A controller: a JAX pytree that turns observations into actions, and may remember something in between."""
 
     def initial_memory(self) -> Any:
-        """What the pilot knows before its first observation, a pytree; () for one that remembers nothing."""
+        """What the controller knows before its first observation, a pytree; () for one that remembers nothing."""
         ...
 
     def act(self, memory: Any, observation: Float[Array, "17"]) -> tuple[Any, Float[Array, "4"]]:

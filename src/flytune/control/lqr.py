@@ -9,15 +9,15 @@ from annotated_types import Gt, Le, Unit
 from jaxtyping import Array, Float
 from scipy.linalg import solve_discrete_are
 
+from flytune.config.document import Real
+from flytune.config.pytree import pytree
 from flytune.control.actuation import PITCH, YAW, action_for, allocate, estimated_rotor_speed, hovering_rotors, mixed
 from flytune.control.sensing import Sensed, heading, sense, wrapped
 from flytune.control.steering import shortened, slowed
-from flytune.document import Real
 from flytune.errors import BadInput
 from flytune.physics import dynamics, rotation
 from flytune.physics.components import Components, pack, unpack
 from flytune.physics.vehicle import Vehicle
-from flytune.pytree import pytree
 
 STATES = 16
 STATE = (

@@ -6,15 +6,15 @@ import jax.numpy as jnp
 from annotated_types import Ge, Gt, Le, Unit
 from jaxtyping import Array, Float
 
+from flytune.config.document import Real
+from flytune.config.pytree import pytree
 from flytune.control.actuation import action_for, allocate, estimated_rotor_speed, hovering_rotors
 from flytune.control.sensing import Sensed, body_axes, dot, heading, sense, wrapped
 from flytune.control.steering import shortened, slowed, specific_force
-from flytune.document import Real
 from flytune.physics.components import Components, add, cross, scale
 from flytune.physics.dynamics import CONTROL_PERIOD
 from flytune.physics.rotation import safe_norm
 from flytune.physics.vehicle import Vehicle
-from flytune.pytree import pytree
 
 PerSecond = Annotated[Real, Gt(0), Unit("1/s")]
 

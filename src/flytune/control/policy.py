@@ -13,8 +13,8 @@ import safetensors
 import safetensors.numpy
 from jaxtyping import Array, Float
 
+from flytune.config.pytree import label, pytree, static
 from flytune.errors import BadInput
-from flytune.pytree import label, pytree, static
 from flytune.task import observation
 
 FORMAT = "flytune-policy-1"
@@ -57,7 +57,7 @@ def make_network(key: jax.Array, sizes: Sequence[int], last_gain: float) -> Netw
 
 @pytree
 class Policy:
-    """A learned pilot: the deterministic action of its actor, squashed into [-1, 1].
+    """A learned controller: the deterministic action of its actor, squashed into [-1, 1].
 
     `clip` cuts a Gaussian policy's mean (PPO); `tanh` squashes smoothly (analytic policy gradient).
     """

@@ -1,13 +1,13 @@
-"""What a classical pilot reads out of the observation: the 17 numbers, with the attitude turned back to the world."""
+"""What a classical controller reads out of the observation: the 17 numbers, with the attitude turned back to the world."""
 
 from typing import Any
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from flytune.config.pytree import pytree
 from flytune.physics import rotation
 from flytune.physics.components import Components, unpack
-from flytune.pytree import pytree
 
 
 @pytree

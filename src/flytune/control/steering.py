@@ -1,4 +1,4 @@
-"""The outer loop that classical pilots share: how a position error is kept from asking for too much."""
+"""The outer loop that classical controllers share: how a position error is kept from asking for too much."""
 
 import math
 from typing import Any

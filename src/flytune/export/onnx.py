@@ -14,12 +14,12 @@ from jaxtyping import Float
 
 from flytune.control.policy import Policy
 from flytune.errors import BadInput
-from flytune.export.onnx_pilot import OnnxPilot, load_onnx, read_onnx
-from flytune.export.onnx_session import CONVENTIONS, FORMAT, INPUT, OUTPUT, VERSION, sample_observations
+from flytune.export.untrusted.onnx_controller import OnnxController, load_onnx, read_onnx
+from flytune.export.untrusted.onnx_session import CONVENTIONS, FORMAT, INPUT, OUTPUT, VERSION, sample_observations
 from flytune.extras import require
 from flytune.task.observation import SIZE
 
-__all__ = ["CONVENTIONS", "OnnxPilot", "load_onnx", "rounding_bound", "save_onnx"]
+__all__ = ["CONVENTIONS", "OnnxController", "load_onnx", "rounding_bound", "save_onnx"]
 
 # Of December 2020: read by onnxruntime 1.6 and everything since, and nothing in the graph has changed after it.
 OPERATOR_SET, INTERMEDIATE_REPRESENTATION = 13, 7
@@ -72,9 +72,9 @@ def rounding_bound(policy: Policy, observations: Float[np.ndarray, "batch 17"]) 
     return error
 
 
-def _check(pilot: OnnxPilot, policy: Policy, path: Path) -> None:
+def _check(controller: OnnxController, policy: Policy, path: Path) -> None:
     observations = sample_observations(CHECKED)
-    difference = np.abs(pilot.session(observations) - np.asarray(jax.jit(policy.__call__)(observations)))
+    difference = np.abs(controller.session(observations) - np.asarray(jax.jit(policy.__call__)(observations)))
     allowed = 2 * rounding_bound(policy, observations)  # each of the two may be that far from the exact action
     if not np.all(difference <= allowed):
         row, motor = np.unravel_index(np.argmax(difference - allowed), difference.shape)

@@ -5,10 +5,10 @@ from typing import Any
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from flytune.config.pytree import pytree
 from flytune.physics import rotation
 from flytune.physics.components import Components, add, cross, scale, unpack
 from flytune.physics.vehicle import Vehicle
-from flytune.pytree import pytree
 
 CONTROL_PERIOD = 0.01  # s (paper R6)
 PHYSICS_STEPS = (
@@ -75,8 +75,8 @@ def thrust_and_torque(vehicle: Vehicle, rotor_speed_rpm: Components) -> tuple[An
 
 def angular_acceleration(vehicle: Vehicle, body_rate: Components, torque: Components) -> Components:
     """w' = I^-1 (tau - w x I w) in rad/s^2, body frame. Source: paper R3."""
-    momentum = tuple(i * w for i, w in zip(vehicle.inertia, body_rate, strict=True))
-    gyroscopic = cross(body_rate, momentum)
+    adam_b1 = tuple(i * w for i, w in zip(vehicle.inertia, body_rate, strict=True))
+    gyroscopic = cross(body_rate, adam_b1)
     return tuple((t - g) / i for t, g, i in zip(torque, gyroscopic, vehicle.inertia, strict=True))
 
 

@@ -7,10 +7,10 @@ from typing import Annotated, Any
 
 from annotated_types import Ge, Gt, Le, Unit
 
-from flytune import document
-from flytune.document import Real, Whole
+from flytune.config import document
+from flytune.config.document import Real, Whole
+from flytune.config.pytree import label, pytree, static
 from flytune.errors import BadInput
-from flytune.pytree import label, pytree, static
 
 
 @pytree

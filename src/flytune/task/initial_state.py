@@ -6,11 +6,11 @@ from typing import Annotated
 import jax
 from annotated_types import Ge, Le, Unit
 
-from flytune.document import Real
+from flytune.config.document import Real
+from flytune.config.pytree import pytree
 from flytune.physics import rotation
 from flytune.physics.dynamics import State, hovering
 from flytune.physics.vehicle import Vehicle
-from flytune.pytree import pytree
 
 Metres = Annotated[Real, Unit("m")]
 
@@ -41,7 +41,7 @@ class InitialState:
         return hovering(vehicle, position, rotation.from_euler(roll, pitch, yaw))
 
 
-EVALUATION_STARTS = {
+EVALUATION_INITIAL_STATES = {
     # paper R19 as printed; 5 % of these start below the altitude bound of R14 (C3)
     "paper": InitialState(
         lowest_position=(-2.0, -2.0, 0.0),

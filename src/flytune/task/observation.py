@@ -1,4 +1,4 @@
-"""The 17 numbers a pilot sees, and their noise (paper R7, R8)."""
+"""The 17 numbers a controller sees, and their noise (paper R7, R8)."""
 
 from collections.abc import Sequence
 from typing import Annotated
@@ -8,11 +8,11 @@ import jax.numpy as jnp
 from annotated_types import Ge, Unit
 from jaxtyping import Array, Float
 
-from flytune.document import Real
+from flytune.config.document import Real
+from flytune.config.pytree import pytree
 from flytune.physics import rotation
 from flytune.physics.components import add, pack, scale, unpack
 from flytune.physics.dynamics import State
-from flytune.pytree import pytree
 from flytune.task.situation import Target, attitude_error, position_error
 
 SIZE = 17
@@ -41,7 +41,7 @@ def observe(
     last_action: Float[Array, "4"],
     normal: Float[Array, "13"],
 ) -> Float[Array, "17"]:
-    """What the pilot sees of a true state: [e_p, q_e, v, w, a_{t-1}].
+    """What the controller sees of a true state: [e_p, q_e, v, w, a_{t-1}].
 
     Args:
         target: where to hover.

@@ -1,4 +1,4 @@
-"""Reward terms: what the pilot is paid for, one small class per term (paper R10).
+"""Reward terms: what the controller is paid for, one small class per term (paper R10).
 
 To add a term: write a class with a `kind`, annotated numbers and `__call__(situation)`, and name it in `RewardTerm`.
 """
@@ -10,10 +10,10 @@ from annotated_types import Ge, Gt, Le, Unit
 from jaxtyping import Array, Float
 from pydantic import Field
 
-from flytune.document import Real
+from flytune.config.document import Real
+from flytune.config.pytree import pytree, static
 from flytune.physics import rotation
 from flytune.physics.components import squared_norm
-from flytune.pytree import pytree, static
 from flytune.task.situation import Situation
 
 Error = Literal["horizontal", "vertical", "position", "velocity", "attitude", "body_rate"]
@@ -41,7 +41,7 @@ def squared_error(situation: Situation, of: Error) -> Float[Array, ""]:
 
 @pytree
 class Survival:
-    """The same reward for every step that is survived; more makes the pilot bolder (H1, H2).
+    """The same reward for every step that is survived; more makes the controller bolder (H1, H2).
 
     Source: paper R10, s; 0.05 in R11 and R12, 0.01 in R13.
     """
@@ -79,7 +79,7 @@ class DualExponential:
 
         reward(e) = weight * (share * exp(-wide * e^2) + (1 - share) * exp(-narrow * e^2))
 
-    `wide` decides how far away the pilot is already paid to come closer; `narrow`, how exactly the target is held.
+    `wide` decides how far away the controller is already paid to come closer; `narrow`, how exactly the target is held.
 
     Source: paper R10, alpha = weight * share, beta = weight * (1 - share).
     """

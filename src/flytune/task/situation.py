@@ -6,11 +6,11 @@ import jax.numpy as jnp
 from annotated_types import Unit
 from jaxtyping import Array, Float
 
-from flytune.document import Real
+from flytune.config.document import Real
+from flytune.config.pytree import pytree
 from flytune.physics import rotation
 from flytune.physics.components import Components, unpack
 from flytune.physics.dynamics import State
-from flytune.pytree import pytree
 
 
 @pytree

@@ -8,22 +8,22 @@ from typing import Annotated, Any
 
 from annotated_types import Ge, Gt, Le, Unit
 
-from flytune import document
-from flytune.document import Real, Whole
+from flytune.config import document
+from flytune.config.document import Real, Whole
+from flytune.config.pytree import label, pytree
 from flytune.errors import BadInput
 from flytune.physics.vehicle import Vehicle, vehicle_table
-from flytune.pytree import label, pytree
 from flytune.task.initial_state import InitialState
 from flytune.task.observation import ObservationNoise
 from flytune.task.reward import RewardTerm
 from flytune.task.situation import Target
 from flytune.task.termination import MaximumSpeed, Termination
-from flytune.task.training import ApgSettings, PpoSettings
+from flytune.task.training_settings import ApgSettings, PpoSettings
 
 
 @pytree
 class Task:
-    """What a pilot is asked to do, with which vehicle, and how it is trained for it."""
+    """What a controller is asked to do, with which vehicle, and how it is trained for it."""
 
     name: str = label(default="custom")
     horizon: Annotated[

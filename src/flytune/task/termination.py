@@ -14,9 +14,9 @@ from annotated_types import Gt, Le, Unit
 from jaxtyping import Array, Float, Int
 from pydantic import Field
 
-from flytune.document import Real
+from flytune.config.document import Real
+from flytune.config.pytree import pytree, static
 from flytune.physics import rotation
-from flytune.pytree import pytree, static
 from flytune.task.situation import Situation
 
 SAFE = -1  # cause of an episode that goes on
@@ -75,7 +75,7 @@ class MaximumTilt:
 
 @pytree
 class MaximumSpeed:
-    """Ends an episode that flies too fast; the strongest knob on settling time (H7).
+    """Ends an episode that flies too fast; the strongest parameter on settling time (H7).
 
     Source: paper R14: 0.8 m/s baseline, 1.0 acrobatic, 0.2 inspection.
     """

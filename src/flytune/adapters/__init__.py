@@ -1,0 +1,1 @@
+"""Interfaces of other projects: Gymnasium, Stable-Baselines3, and a picture."""

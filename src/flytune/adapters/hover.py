@@ -1,0 +1,152 @@
+"""What flytune's two Gymnasium environments share: task, spaces, the judgement of what a user gives, the picture."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from flytune.adapters.single import parts
+from flytune.errors import BadInput
+from flytune.extras import require
+from flytune.physics.dynamics import CONTROL_PERIOD
+from flytune.task.observation import SIZE
+from flytune.task.task import Task, load_task
+
+if TYPE_CHECKING:
+    import gymnasium
+else:
+    gymnasium = require("gymnasium", "gymnasium")  # a missing one in one line
+
+RENDER_MODES = ("rgb_array",)
+METADATA = {"render_modes": list(RENDER_MODES), "render_fps": round(1 / CONTROL_PERIOD)}
+TRAIL = 300  # steps of the way behind a vehicle that a picture shows
+FARTHEST = 1000.0  # m, also rad: of a start given by hand
+SETTLED = 0.02  # m, the sphere a picture shows around the target: the band in which a response counts as settled
+
+
+def read_task(task: str | Path | Task, edits: dict[str, Any] | None) -> Task:
+    """The task by preset name or file, edited, or the Task itself.
+
+    Raises:
+        BadInput: no such task, or edits of a Task.
+    """
+    if not isinstance(task, Task):
+        return load_task(task, edits)
+    if edits:
+        raise BadInput(
+            "edits: a Task cannot be edited here. Allowed: edits of a preset or a file. Edit the Task itself."
+        )
+    return task
+
+
+def read_render_mode(mode: str | None) -> str | None:
+    """The render mode itself.
+
+    Raises:
+        BadInput: an unknown one, or Pillow is not installed.
+    """
+    if mode is not None and mode not in RENDER_MODES:
+        raise BadInput(f"render_mode: {mode!r} is not allowed. Allowed: None, {', '.join(RENDER_MODES)}.")
+    if mode is not None:
+        require("PIL.Image", "gymnasium")
+    return mode
+
+
+def make_spaces() -> tuple[gymnasium.spaces.Box, gymnasium.spaces.Box]:
+    """The spaces of one observation and one action.
+
+    An observation may be any finite number; infinite bounds would say the same, but `check_env` warns of them.
+    """
+    largest = float(np.finfo(np.float32).max)
+    observation = gymnasium.spaces.Box(-largest, largest, (SIZE,), np.float32)
+    return observation, gymnasium.spaces.Box(-1.0, 1.0, (4,), np.float32)
+
+
+def read_action(action: Any, shape: tuple[int, ...]) -> np.ndarray:
+    """The action as float32 of that shape.
+
+    Raises:
+        InvalidAction: another shape, no numbers, or not finite.
+    """
+    try:
+        numbers = np.asarray(action, np.float32)
+    except (TypeError, ValueError):
+        raise gymnasium.error.InvalidAction(f"action: {action!r} is no array of numbers. Allowed: {shape}.") from None
+    if numbers.shape != shape:
+        raise gymnasium.error.InvalidAction(f"action: shape {numbers.shape} is not allowed. Allowed: {shape}.")
+    if not np.isfinite(numbers).all():
+        raise gymnasium.error.InvalidAction("action: not every number is finite. Allowed: -1 to 1, others are clipped.")
+    return numbers
+
+
+def read_start(options: dict[str, Any] | None) -> dict[str, Any] | None:
+    """The start that the options of `reset` ask for, None where they ask for none.
+
+    Raises:
+        BadInput: an unknown option or an impossible start.
+    """
+    if not options:
+        return None
+    _refuse_unknown(options, ("position", "yaw"))
+    if "position" not in options:
+        raise BadInput("options.position: is missing. Allowed: [x, y, z] in metres, beside yaw.")
+    for name, shape, allowed in (("position", (3,), "three numbers"), ("yaw", (), "one number")):
+        given = options.get(name, 0.0)
+        try:
+            numbers = np.asarray(given, float)
+        except (TypeError, ValueError):
+            numbers = np.array(np.nan)
+        if numbers.shape != shape or not (np.abs(numbers) <= FARTHEST).all():
+            raise BadInput(f"options.{name}: {given!r} is not allowed. Allowed: {allowed} within {FARTHEST}.")
+    return {"position": options["position"], "yaw": options.get("yaw", 0.0)}
+
+
+def read_mask(options: dict[str, Any] | None, number: int) -> np.ndarray | None:
+    """The environments that the options of a vector's `reset` name, None for all.
+
+    Raises:
+        BadInput: an unknown option, or a mask that is none.
+    """
+    if not options:
+        return None
+    _refuse_unknown(options, ("reset_mask",))
+    mask = np.asarray(options["reset_mask"])
+    if mask.shape != (number,) or mask.dtype != np.bool_ or not mask.any():
+        raise BadInput(
+            f"options.reset_mask: {mask.dtype} of shape {mask.shape} is not allowed. "
+            f"Allowed: bool of shape ({number},), at least one of them true."
+        )
+    return mask
+
+
+def _refuse_unknown(options: dict[str, Any], known: tuple[str, ...]) -> None:
+    for name in options:
+        if name not in known:
+            raise BadInput(f"options.{name}: is unknown. Allowed: {', '.join(known)}.")
+
+
+def take_picture(task: Task, body: np.ndarray, trail: np.ndarray, steps: int, reward: float) -> np.ndarray:
+    """The picture of a body's 17 numbers, with the way it came."""
+    from flytune.adapters import picture  # here, because it needs Pillow
+
+    part = parts(np.nan_to_num(body).astype(float))
+    target = np.array(task.target.position, float)
+    distance, speed = np.linalg.norm(body[:3] - target), np.linalg.norm(part["velocity"])
+    scene = picture.Scene(
+        position=part["position"],
+        attitude=part["attitude"],
+        thrust=(part["rotor_speed_rpm"] / task.vehicle.hover_rotor_speed_rpm) ** 2,
+        arm=float(task.vehicle.arm),
+        propeller_radius=float(task.vehicle.propeller_radius),
+        target=target,
+        target_yaw=float(task.target.yaw),
+        band=SETTLED,
+        trail=np.nan_to_num(trail).astype(float),
+        lines=(
+            ("time", f"{steps * CONTROL_PERIOD:.2f} s"),
+            ("distance", f"{distance:.3f} m"),
+            ("speed", f"{speed:.2f} m/s"),
+            ("reward", f"{reward:.3f}"),
+        ),
+    )
+    return picture.draw(scene)

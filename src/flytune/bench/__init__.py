@@ -1,0 +1,1 @@
+"""Throughput on this machine, and that of the baselines: Stable-Baselines3 and PyBullet."""

@@ -1,0 +1,157 @@
+"""Throughput on this machine, as ratios measured in one run, since a time alone says more about the machine."""
+
+import dataclasses
+import itertools
+import os
+import time
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from flytune.bench.baselines import Row, compare_simulation, compare_training
+from flytune.simulation import environment
+from flytune.task.observation import NOISY
+from flytune.task.task import Task, load_task
+from flytune.task.training_settings import PpoSettings
+from flytune.training import apg, ppo
+from flytune.training.loop import steps_per_update
+
+BATCH, WIDTH = 128, 64  # of the matrix product everything is compared with: 128 x 64 times 64 x 64, float32
+SIMULATED = 1024, 200  # environments and steps of a compiled simulation
+REPEATS = 5  # the fastest counts: other work on the machine only ever slows a run down
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Throughput:
+    """What was measured; rates in environment steps per second."""
+
+    matrix_product: float  # floating-point operations per second
+    ppo: float | None
+    ppo_share_of_limit: float | None  # of what the matrix product alone would allow
+    apg: float | None
+    simulate: float | None
+    training: list[Row] | None  # beside Stable-Baselines3 and PyBullet
+    simulation: list[Row] | None
+    device: str
+    cores: int | None
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values, for JSON."""
+        return dataclasses.asdict(self)
+
+    def table(self) -> str:
+        """The measurements for a terminal."""
+        lines = [
+            f"device {self.device}, {self.cores} cores, XLA_FLAGS={os.environ.get('XLA_FLAGS', '')!r}",
+            f"{BATCH} x {WIDTH} x {WIDTH} float32 matrix product   {self.matrix_product / 1e9:8.1f} GFLOP/s",
+        ]
+        if self.ppo is not None and self.ppo_share_of_limit is not None:
+            lines.append(
+                f"train ppo (128 environments x 128 steps)   {self.ppo:10,.0f} steps/s   "
+                f"{self.ppo_share_of_limit:.2f} of the product's limit"
+            )
+        if self.apg is not None:
+            lines.append(f"train apg (forward and backward)           {self.apg:10,.0f} steps/s")
+        if self.simulate is not None:
+            lines.append(f"simulate (observe, step, reward, reset)    {self.simulate:10,.0f} steps/s")
+        for title, rows in (("training", self.training), ("simulation", self.simulation)):
+            if rows is not None:
+                heading = f"{title} (environments x steps, processes that simulate; ratio to the first row)"
+                lines += ["", heading, *(f"  {row.line()}" for row in rows)]
+        return "\n".join(lines)
+
+
+def bench(what: str = "all") -> Throughput:
+    """Throughput of training and of simulation, beside a plain matrix product and what else is installed.
+
+    Args:
+        what: `train`, `simulate` or `all`.
+    """
+    task = load_task("baseline")
+    training, simulation = what in ("all", "train"), what in ("all", "simulate")
+    product = _matrix_product()
+    ppo_update, fly = _training(ppo, task, task.ppo), _simulation(task)
+    ppo_rate = steps_per_update(task, "ppo") / _fastest(ppo_update) if training else None
+    product = max(product, _matrix_product())  # the limit is what the machine can do undisturbed
+    return Throughput(
+        matrix_product=product,
+        ppo=ppo_rate,
+        ppo_share_of_limit=ppo_rate * operations_per_step(task.ppo) / product if ppo_rate else None,
+        apg=steps_per_update(task, "apg") / _fastest(_training(apg, task, task.apg)) if training else None,
+        simulate=SIMULATED[0] * SIMULATED[1] / _fastest(fly) if simulation else None,
+        training=compare_training(task, ppo_update) if training else None,
+        simulation=compare_simulation(task, fly, SIMULATED) if simulation else None,
+        device=jax.devices()[0].platform,
+        cores=os.cpu_count(),
+    )
+
+
+def operations_per_step(settings: PpoSettings) -> float:
+    """Floating-point operations the networks of PPO need per environment step, products alone.
+
+    Each epoch runs actor and critic forward and backward (3 times forward), the rollout runs the actor once and the
+    critic twice (before and after the step); a multiplication and its addition count as two.
+    """
+    sizes = (17, *settings.hidden)
+    trunk = sum(a * b for a, b in itertools.pairwise(sizes))
+    actor, critic = trunk + 4 * sizes[-1], trunk + sizes[-1]
+    return 2.0 * (3 * settings.epochs * (actor + critic) + actor + 2 * critic)
+
+
+def _fastest(run: Callable[[], Any]) -> float:
+    run()
+    times = []
+    for _ in range(REPEATS):
+        started = time.perf_counter()
+        run()
+        times.append(time.perf_counter() - started)
+    return min(times)
+
+
+def _matrix_product() -> float:
+    first = jax.random.normal(jax.random.key(0), (BATCH, WIDTH))
+    second = jax.random.normal(jax.random.key(1), (WIDTH, WIDTH)) / WIDTH**0.5
+    number = 5000
+
+    @jax.jit
+    def chain(first: jax.Array) -> jax.Array:
+        return jax.lax.scan(lambda x, _: (x @ second, None), first, length=number)[0]
+
+    return 2.0 * BATCH * WIDTH * WIDTH * number / _fastest(lambda: jax.block_until_ready(chain(first)))
+
+
+def _training(teacher: Any, task: Task, settings: Any) -> Callable[[], Any]:
+    """One update of a trainer, each going on from the one before."""
+    train_state = None
+
+    def one() -> Any:
+        nonlocal train_state
+        train_state = teacher.start(task, settings, jax.random.key(0)) if train_state is None else train_state
+        train_state, seen = teacher.update(task, settings, train_state)
+        return jax.block_until_ready(seen)
+
+    return one
+
+
+def _simulation(task: Task) -> Callable[[], Any]:
+    """A flight of many episodes in one compiled call."""
+    environments, steps = SIMULATED
+    keys = jax.random.split(jax.random.key(0), environments)
+    episodes = jax.vmap(lambda key: environment.reset(task, key), out_axes=-1)(keys)
+
+    def one_step(episode: environment.Episode, normal: jax.Array, key: jax.Array) -> Any:
+        seen = environment.look(task, episode, normal)
+        moved, outcome = environment.step(task, episode, 0.1 * seen[:4])
+        return environment.autoreset(task, moved, outcome, key), outcome.reward
+
+    @jax.jit
+    def fly(episodes: environment.Episode, key: jax.Array) -> Any:
+        noise_key, reset_key = jax.random.split(key)
+        normal = jax.random.normal(noise_key, (steps, NOISY, environments))
+        keys = jax.random.split(reset_key, (steps, environments))
+        batch = jax.vmap(one_step, in_axes=-1, out_axes=-1)
+        return jax.lax.scan(lambda carry, now: batch(carry, *now), episodes, (normal, keys))[1].mean()
+
+    return lambda: jax.block_until_ready(fly(episodes, jnp.asarray(jax.random.key(1))))

@@ -1,0 +1,1 @@
+"""Configuration: TOML to dataclasses and back, and files that are whole or absent."""

@@ -1,0 +1,1 @@
+"""Evaluation: flights are recorded, judged and compared, whatever flew them."""

@@ -1,0 +1,96 @@
+"""Comparing: judgements of several controllers over the same trials, side by side and trial by trial."""
+
+import dataclasses
+from collections.abc import Sequence
+
+from flytune.errors import BadInput
+from flytune.evaluation.comparison_table import MAY_DIFFER, comparison_table
+from flytune.evaluation.difference import METRICS, Difference, compare_metric
+from flytune.evaluation.judge import Judgement
+
+SHARED = {  # what has to be the same: the option that sets it, and its unit
+    "trials": ("trials", ""),
+    "seed": ("seed", ""),
+    "initial_conditions": ("starts", ""),
+    "duration": ("duration", " s"),
+}
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
+class Comparison:
+    """Several controllers over the same trials, each under a name of its own, and how each differs from the reference."""
+
+    judgements: tuple[Judgement, ...]
+    reference: int  # which of them the others are compared with
+    differences: tuple[Difference, ...]  # per controller but the reference, and per metric
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The controllers' names, no two alike."""
+        return tuple(judgement.name for judgement in self.judgements)
+
+    def to_dict(self) -> dict:
+        """The object that `compare --json` prints, of plain Python values; None where a number is infinite."""
+        return {
+            "schema": 1,
+            "reference": self.names[self.reference],
+            "controllers": [judgement.to_dict() for judgement in self.judgements],
+            "differences": [difference.to_dict() for difference in self.differences],
+        }
+
+    def table(self) -> str:
+        """The comparison for a terminal: a row per controller, then the differences in words."""
+        return comparison_table(self.judgements, self.reference, self.differences)
+
+    __str__ = table
+
+
+def compare(judgements: Sequence[Judgement], *, reference: int = 0) -> Comparison:
+    """The comparison of two or more controllers over the same trials.
+
+    Start and noise of a trial depend on seed and trial alone, so that trial i of one controller is paired with trial i of
+    the reference: the luck of the draw, which is most of the spread between trials, drops out of their difference.
+    World, task and vehicle may differ; that is then what is compared.
+
+    Args:
+        judgements: of the controllers, in the order of the table; names that occur twice are made different.
+        reference: the index of the controller that the others are compared with.
+
+    Raises:
+        BadInput: fewer than two, no such reference, or trials that are not the same.
+
+    Source: docs, definitions.
+    """
+    if len(judgements) < 2:
+        raise BadInput(f"compare: {len(judgements)} controller is not allowed. Allowed: two or more. Name another one.")
+    if not 0 <= reference < len(judgements):
+        raise BadInput(f"reference: {reference} is not allowed. Allowed: 0 to {len(judgements) - 1}, a controller.")
+    named = _distinguish(judgements)
+    for field, (option, unit) in SHARED.items():
+        first, *others = ((controller.name, getattr(controller, field)) for controller in named)
+        for name, value in others:
+            if value != first[1]:
+                raise BadInput(
+                    f"{option}: {first[1]}{unit} for {first[0]} and {value}{unit} for {name} is not allowed. "
+                    f"Allowed: the same for every controller. Fly all of them with one --{option}."
+                )
+    against = named[reference]
+    others = [controller for controller in named if controller is not against]
+    differences = tuple(compare_metric(controller, against, metric) for controller in others for metric in METRICS)
+    return Comparison(judgements=tuple(named), reference=reference, differences=differences)
+
+
+def _distinguish(judgements: Sequence[Judgement]) -> list[Judgement]:
+    """The judgements, no two names alike: told apart by what differs, by numbers where nothing does."""
+    named: dict[str, Judgement] = {}
+    for judgement in judgements:
+        alike = [other for other in judgements if other.name == judgement.name]
+        telling = (field for field in MAY_DIFFER if len({getattr(one, field) for one in alike}) == len(alike) > 1)
+        told = [str(getattr(judgement, field)) for field in telling][:1]
+        name = unique = " ".join([judgement.name or "controller", *(f"({text})" for text in told)])
+        number = 1
+        while unique in named:
+            number += 1
+            unique = f"{name} ({number})"
+        named[unique] = dataclasses.replace(judgement, name=unique)
+    return list(named.values())

@@ -1,0 +1,174 @@
+"""What makes a file no policy: everything that can be told from its bytes, before anything in it is run.
+
+A model may come from anywhere. It may name other files for its weights, loop for ever, or draw random numbers; none
+of that belongs into a policy, so only arithmetic that is known to be harmless is let through.
+"""
+
+import math
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+
+from flytune.errors import BadInput
+from flytune.export.untrusted.onnx_session import CONVENTIONS, INPUT, OUTPUT
+from flytune.extras import require
+from flytune.task.observation import SIZE
+
+# fmt: off
+OPERATORS = {
+    "Abs", "Add", "And", "BatchNormalization", "Cast", "Ceil", "Celu", "Clip", "Concat", "Constant", "Cos", "Div",
+    "Elu", "Equal", "Erf", "Exp", "Flatten", "Floor", "Gather", "Gelu", "Gemm", "Greater", "GreaterOrEqual",
+    "HardSigmoid", "HardSwish", "Identity", "LayerNormalization", "LeakyRelu", "Less", "LessOrEqual", "Log",
+    "MatMul", "Max", "Mean", "Min", "Mish", "Mul", "Neg", "Not", "Or", "PRelu", "Pow", "Reciprocal", "ReduceL2",
+    "ReduceMax", "ReduceMean", "ReduceMin", "ReduceSum", "Relu", "Reshape", "Selu", "Shape", "Sigmoid", "Sign",
+    "Sin", "Slice", "Softmax", "Softplus", "Softsign", "Split", "Sqrt", "Squeeze", "Sub", "Sum", "Swish", "Tanh",
+    "ThresholdedRelu", "Transpose", "Unsqueeze", "Where",
+}
+# fmt: on
+WIDEST = 1_000_000  # numbers that one node may make of one observation; the paper's network makes 64
+NUMBERS = ("FLOAT", "FLOAT16", "DOUBLE", "INT32", "INT64", "BOOL")
+
+
+def inspect(content: bytes, where: str) -> Any:
+    """The model in the bytes of a file, when nothing speaks against running it; no other file is opened.
+
+    Raises:
+        BadInput: not ONNX, more than arithmetic, weights elsewhere or not finite, not from observation to action.
+    """
+    onnx = require("onnx", "onnx")
+    try:
+        model = onnx.load_model_from_string(content)
+    except Exception as error:  # of several kinds, one for each way in which protobuf gives up
+        raise BadInput(f"{where}: is not an ONNX model ({first_line(error)}). Give the file of a policy.") from None
+    if not model.graph.node:
+        raise BadInput(f"{where}: is not an ONNX model (there is no graph in it). Give the file of a policy.")
+    model.DiscardUnknownFields()  # what has not been looked at is not run either
+    _refuse_other_files(onnx, model, where)
+    _refuse_more_than_arithmetic(onnx, model, where)
+    _refuse_other_ends(onnx, model.graph, where)
+    try:
+        onnx.checker.check_model(model, full_check=True)
+        inferred = onnx.shape_inference.infer_shapes(model, data_prop=True)
+    except Exception as error:  # ValidationError, InferenceError, and RuntimeError from below
+        raise BadInput(f"{where}: is a damaged ONNX model ({first_line(error)}). Export it again.") from None
+    _refuse_wide_nodes(inferred, where)
+    _refuse_other_conventions(model, where)
+    _refuse_broken_numbers(onnx, model, where)
+    return model
+
+
+def metadata(model: Any) -> dict[str, str]:
+    """The entries of a model's metadata."""
+    return {entry.key: entry.value for entry in model.metadata_props}
+
+
+def first_line(error: Exception) -> str:
+    """What an error of another package says, cut down to part of a line."""
+    text = " ".join(str(error).split())
+    return text if len(text) <= 150 else f"{text[:150]}..."
+
+
+def _messages(message: Any) -> Iterator[Any]:
+    """A protobuf message and all those inside it, whatever field they hide in."""
+    yield message
+    for field, value in message.ListFields():
+        if field.message_type is not None:
+            for child in [value] if hasattr(value, "ListFields") else value:
+                yield from _messages(child)
+
+
+def _tensors(onnx: Any, model: Any) -> Iterator[Any]:
+    return (message for message in _messages(model) if isinstance(message, onnx.TensorProto))
+
+
+def _refuse_other_files(onnx: Any, model: Any, where: str) -> None:
+    for tensor in _tensors(onnx, model):
+        if tensor.external_data or tensor.data_location == onnx.TensorProto.EXTERNAL:
+            raise BadInput(
+                f"{where}: tensor {_shown(tensor.name)} is kept in another file, which is not allowed. "
+                "Allowed: all weights inside. Save it with onnx.save(onnx.load(path), path)."
+            )
+
+
+def _refuse_more_than_arithmetic(onnx: Any, model: Any, where: str) -> None:
+    if model.functions or model.training_info or model.graph.sparse_initializer:
+        raise BadInput(
+            f"{where}: holds functions, training or sparse weights, which are not allowed. "
+            "Allowed: one graph of standard operators. Export it for inference, with functions inlined."
+        )
+    for node in (message for message in _messages(model) if isinstance(message, onnx.NodeProto)):
+        if node.domain not in ("", "ai.onnx") or node.op_type not in OPERATORS:
+            name = f"{node.domain}::{node.op_type}" if node.domain else node.op_type
+            raise BadInput(
+                f"{where}: operator {_shown(name)} is not allowed. Allowed: the standard operators of a "
+                "feed-forward network (MatMul, Gemm, Add, Tanh, Relu, Clip, ...), without loops or randomness."
+            )
+
+
+def _refuse_other_ends(onnx: Any, graph: Any, where: str) -> None:
+    weights = {tensor.name for tensor in graph.initializer}  # old models list them among the inputs
+    inputs = [value for value in graph.input if value.name not in weights]
+    for kind, found, name, size in (("input", inputs, INPUT, SIZE), ("output", list(graph.output), OUTPUT, 4)):
+        wanted = f"Allowed: one {kind} {name!r}, float32 [batch, {size}]. Export it so."
+        if [value.name for value in found] != [name]:
+            names = ", ".join(_shown(value.name) for value in found) or "none"
+            raise BadInput(f"{where}: has the {kind}s {names}. {wanted}")
+        kind_of_number = found[0].type.tensor_type.elem_type
+        if kind_of_number != onnx.TensorProto.FLOAT:
+            shown = onnx.TensorProto.DataType.Name(kind_of_number) if kind_of_number in range(1, 17) else "unknown"
+            raise BadInput(f"{where}: {kind} {name!r} is of type {shown}. {wanted}")
+        shape = [size.dim_value or size.dim_param or "?" for size in found[0].type.tensor_type.shape.dim]
+        if len(shape) != 2 or shape[1] != size:
+            raise BadInput(f"{where}: {kind} {name!r} has shape {_shown(shape)}. {wanted}")
+        if isinstance(shape[0], int):
+            raise BadInput(
+                f"{where}: {kind} {name!r} takes a batch of {shape[0]} only. Allowed: any batch, so that many trials "
+                "are flown at once. Export it with a dynamic first axis."
+            )
+
+
+def _refuse_wide_nodes(inferred: Any, where: str) -> None:
+    for value in inferred.graph.value_info:
+        width = math.prod(size.dim_value or 1 for size in value.type.tensor_type.shape.dim)
+        if width > WIDEST:
+            raise BadInput(f"{where}: node {_shown(value.name)} makes {width} numbers. Allowed: up to {WIDEST}.")
+
+
+def _refuse_other_conventions(model: Any, where: str) -> None:
+    found = metadata(model)
+    if not all(isinstance(text, str) for text in (*found, *found.values())):
+        raise BadInput(f"{where}: has damaged metadata (bytes that are not UTF-8). Export it again.")
+    for key, wanted in CONVENTIONS.items():
+        if found.get(key) != wanted:
+            has = f"is {_shown(found[key])}" if key in found else "is missing"
+            raise BadInput(
+                f"{where}: the metadata entry {key!r} {has}. Allowed: {wanted!r}. If the model keeps to that, set it: "
+                "onnx.helper.set_model_props(model, flytune.export.onnx.CONVENTIONS)."
+            )
+
+
+def _refuse_broken_numbers(onnx: Any, model: Any, where: str) -> None:
+    allowed = {getattr(onnx.TensorProto, name) for name in NUMBERS}
+    for tensor in _tensors(onnx, model):
+        if tensor.data_type not in allowed:
+            raise BadInput(f"{where}: tensor {_shown(tensor.name)} holds no numbers. Allowed: {', '.join(NUMBERS)}.")
+        try:
+            values = onnx.numpy_helper.to_array(tensor)
+        except Exception as error:  # its size does not fit its shape
+            shown = f"{_shown(tensor.name)} is damaged ({first_line(error)})"
+            raise BadInput(f"{where}: tensor {shown}. Export it again.") from None
+        _refuse_not_finite(values, f"tensor {_shown(tensor.name)}", where)
+    for attribute in (message for message in _messages(model) if isinstance(message, onnx.AttributeProto)):
+        _refuse_not_finite(np.array([attribute.f, *attribute.floats]), f"attribute {_shown(attribute.name)}", where)
+
+
+def _refuse_not_finite(values: np.ndarray, what: str, where: str) -> None:
+    if not np.all(np.isfinite(values)):
+        raise BadInput(f"{where}: {what} holds numbers that are not finite. Train it again.")
+
+
+def _shown(value: Any) -> str:
+    """A foreign text on one line, not longer than a reader wants."""
+    text = repr(value)
+    return text if len(text) <= 80 else f"{text[:80]}..."

@@ -1,0 +1,274 @@
+"""Figures of several controllers over the same trials; a controller has one colour and one number in all of them."""
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import plotly.graph_objects as go
+from jaxtyping import Float
+from plotly.subplots import make_subplots
+
+from flytune.evaluation import metrics
+from flytune.evaluation.comparison import Comparison
+from flytune.evaluation.comparison_table import WAYS
+from flytune.evaluation.difference import METRICS, Difference, Metric
+from flytune.evaluation.flights import Flights
+from flytune.evaluation.judge import CHANNELS
+from flytune.report import plots, style
+from flytune.report.style import heading, label
+
+TRIALS_SHOWN = 3  # of each controller, the first ones; more lines than these hide each other
+FLOOR = 0.002  # of the band; an error below it is drawn there, as a logarithmic axis has no zero
+BOXES = (
+    "position.settling_time",
+    "yaw.settling_time",
+    "position.overshoot",
+    "yaw.overshoot",
+    "position.steady_state_error",
+    "yaw.steady_state_error",
+    "peak_speed",
+    "action.total_variation",
+)
+NAMES = {
+    "settling_time": "settling time",
+    "overshoot": "overshoot",
+    "steady_state_error": "steady-state error",
+    "rms_error": "RMS error",
+    "peak_speed": "peak speed",
+    "action_rms": "action, RMS",
+    "action_total_variation": "action, change",
+}
+SCALES = {"s": ("s", 1.0), "m": ("mm", 1e3), "rad": ("deg", math.degrees(1)), "m/s": ("m/s", 1.0), "1": ("1", 1.0)}
+
+
+def title(metric: Metric) -> str:
+    """A metric in words."""
+    return " ".join(filter(None, [metric.channel, NAMES[metric.field]]))
+
+
+def unit(metric: Metric) -> tuple[str, float]:
+    """The unit a metric is shown in, and its factor."""
+    return ("%", 100.0) if metric.field == "overshoot" else SCALES[metric.unit]
+
+
+def responses(flights: Sequence[Flights], comparison: Comparison) -> go.Figure:
+    """x, y, z, yaw and distance: the same few trials of every controller, and the error of all trials as it dies out."""
+    figure = make_subplots(
+        len(CHANNELS),
+        2,
+        shared_xaxes="all",  # pyright: ignore[reportArgumentType]  (its stub knows booleans only)
+        vertical_spacing=0.03,
+        horizontal_spacing=0.1,
+        subplot_titles=[heading("the same few trials"), heading("error over all trials: median and middle half")],
+    )
+    shown = min(TRIALS_SHOWN, flights[0].trials)
+    opacity = 0.16 if len(flights) < 4 else 0.07  # many shades above each other only darken the picture
+    for row, channel in enumerate(CHANNELS, start=1):
+        unit = "deg" if channel == "yaw" else "m"
+        _, target, band = _course(flights[0], channel)
+        errors = []
+        for index, flown in enumerate(flights):
+            figure.add_trace(_trials(flown, channel, shown, index), row=row, col=1)
+            errors += _errors(flown, comparison.judgements[index].crashed, channel, index, opacity)
+        figure.add_traces(errors, rows=row, cols=2)
+        plots.target_and_band(figure, row, 1, target, band)
+        low, high = _reach(errors, band)
+        place: dict[str, Any] = {"row": row, "col": 2}
+        figure.add_hrect(low / 2, band, fillcolor=style.BAND, line_width=0, layer="below", **place)
+        decades: dict[str, Any] = {
+            "type": "log",
+            "dtick": 1,
+            "exponentformat": "none",
+            "range": [math.log10(low), math.log10(high)],
+        }
+        figure.update_yaxes(title_text=f"|{channel} error| [{unit}]", **decades, **place)
+        title_text = f"{'distance' if channel == 'position' else channel} [{unit}]"
+        figure.update_yaxes(title_text=title_text, row=row, col=1)
+    figure.update_xaxes(range=[0, flights[0].duration], hoverformat=".2f")
+    figure.update_xaxes(title_text="time [s]", row=len(CHANNELS))
+    return _finish(figure, comparison.names, range(len(flights)), 1000, hovermode="x")
+
+
+def _reach(errors: Sequence[go.Scatter], band: float) -> tuple[float, float]:
+    """Ends of an axis that shows all curves, and the edge of the band, with some room."""
+    values = np.concatenate([np.asarray(trace.y, dtype=np.float64) for trace in errors])
+    known = np.append(values[np.isfinite(values)], band)
+    return known.min() / 1.6, known.max() * 1.6
+
+
+def _course(flights: Flights, channel: str) -> tuple[Float[np.ndarray, "N K"], float, float]:
+    """Values, target and band of an axis, or the distance from the target, which is to be 0."""
+    if channel != "position":
+        return plots.course(flights, channel)
+    return np.linalg.norm(flights.position - flights.target_position, axis=-1), 0.0, metrics.POSITION_BAND
+
+
+def _error(flights: Flights, channel: str) -> Float[np.ndarray, "N K"]:
+    """Absolute error of a channel in the unit of its course; of yaw the shorter way round, as the band sees it."""
+    values, target, _ = _course(flights, channel)
+    error = np.asarray(values, dtype=np.float64) - target
+    return np.abs(np.degrees(metrics.wrap_angle(np.radians(error))) if channel == "yaw" else error)
+
+
+def _trials(flights: Flights, channel: str, shown: int, index: int) -> go.Scatter:
+    """The first trials of one controller as one trace, so that its name hides and shows them together."""
+    step = plots.stride(flights)
+    values = _course(flights, channel)[0][:shown, ::step]
+    gap = np.full((shown, 1), np.nan)
+    time = np.broadcast_to(flights.time[::step], values.shape)
+    return go.Scatter(
+        x=np.concatenate([time, gap], axis=1).ravel().astype(np.float32),
+        y=np.concatenate([values, gap], axis=1).ravel().astype(np.float32),
+        mode="lines",
+        line={"color": style.colour(index), "width": 1.3, "simplify": False},
+        hovertemplate="%{y:.3f}",
+        meta=index,
+    )
+
+
+def _errors(flights: Flights, crashed: np.ndarray, channel: str, index: int, opacity: float) -> list[go.Scatter]:
+    """Median and middle half of the error over all trials; a crashed trial is infinitely far at every instant."""
+    step = plots.stride(flights)
+    error = np.where(crashed[:, None], np.inf, _error(flights, channel)[:, ::step])
+    floor = FLOOR * _course(flights, channel)[2]
+    low, middle, high = (_quantile(error, share, floor) for share in (0.25, 0.5, 0.75))
+    colour = style.colour(index)
+    common: dict[str, Any] = {"x0": 0, "dx": step * float(flights.time[1]), "mode": "lines", "meta": index}
+    edge: dict[str, Any] = {"line": {"width": 0, "color": colour}, "hoverinfo": "skip"}
+    shade = f"rgba({', '.join(str(int(colour[at : at + 2], 16)) for at in (1, 3, 5))}, {opacity})"
+    line = {"color": colour, "width": 1.8, "simplify": False}
+    return [
+        go.Scatter(**common, **edge, y=low),
+        go.Scatter(**common, **edge, y=high, fill="tonexty", fillcolor=shade),
+        go.Scatter(**common, y=middle, line=line, hovertemplate="%{y:.4f}"),
+    ]
+
+
+def _quantile(error: Float[np.ndarray, "N K"], share: float, floor: float) -> Float[np.ndarray, "K"]:
+    """The error that this share of the trials does not exceed, at every instant; NaN, a gap, where it is infinite."""
+    ranked = np.sort(np.where(np.isnan(error), np.inf, error), axis=0)
+    chosen = np.maximum(ranked[max(math.ceil(share * len(ranked) - 1e-9) - 1, 0)], floor)
+    return np.where(np.isfinite(chosen), chosen, np.nan).astype(np.float32)
+
+
+def boxes(comparison: Comparison) -> go.Figure | str:
+    """Box plots of each metric, the controllers side by side, with the number of trials that each box holds."""
+    chosen = [metric for metric in METRICS if metric.name in BOXES]
+    figure = make_subplots(
+        2, 4, vertical_spacing=0.2, horizontal_spacing=0.07, subplot_titles=[heading(title(one)) for one in chosen]
+    )
+    drawn = 0
+    for panel, metric in enumerate(chosen):
+        row, column = divmod(panel, 4)
+        symbol, scale = unit(metric)
+        ticks = []
+        for index, judgement in enumerate(comparison.judgements):
+            values = metric.values(judgement)
+            finite = values[np.isfinite(values)] * scale
+            drawn += finite.size
+            ticks.append(f"<b>{index + 1}</b><br>{finite.size}")
+            trace = plots.box(finite, index, "", style.colour(index))
+            trace.update(meta=index)
+            figure.add_trace(trace, row=row + 1, col=column + 1)
+        place: dict[str, Any] = {"row": row + 1, "col": column + 1}
+        count = len(comparison.judgements)
+        figure.update_xaxes(tickvals=list(range(count)), ticktext=ticks, range=[-0.6, count - 0.4], **place)
+        figure.update_yaxes(title_text=f"[{symbol}]", rangemode="tozero", **place)
+    if not drawn:
+        return "Every trial of every controller crashed, so there is nothing to draw."
+    figure.update_xaxes(showgrid=False, tickangle=0, tickfont_size=11)
+    return _finish(figure, comparison.names, range(len(comparison.names)), 580)
+
+
+def paired(comparison: Comparison) -> go.Figure:
+    """Median difference of each controller from the reference, metric by metric, with its interval; zero is as good."""
+    columns = 4
+    rows = math.ceil(len(METRICS) / columns)
+    others = [index for index in range(len(comparison.names)) if index != comparison.reference]
+    gap = 92  # px between the panels of a column, for ticks and titles
+    height = rows * (38 + 24 * len(others)) + (rows - 1) * gap
+    figure = make_subplots(
+        rows,
+        columns,
+        vertical_spacing=gap / height,
+        horizontal_spacing=0.05,
+        subplot_titles=[heading(title(metric)) for metric in METRICS],
+    )
+    for panel, metric in enumerate(METRICS):
+        row, column = (number + 1 for number in divmod(panel, columns))
+        found = [one for one in comparison.differences if one.metric is metric]
+        _draw_differences(figure, found, others, row, column)
+        more, less = WAYS[metric.field]
+        figure.update_xaxes(title_text=f"← {less}  [{unit(metric)[0]}]  {more} →", row=row, col=column)
+    ticks = {"tickvals": list(range(len(others))), "ticktext": [f"<b>{index + 1}</b>" for index in others]}
+    figure.update_yaxes(**ticks, range=[len(others) - 0.4, -0.6])
+    figure.update_xaxes(nticks=5, tickfont_size=11, exponentformat="none")
+    figure = _finish(figure, comparison.names, others, height)
+    figure.update_yaxes(showgrid=False)
+    figure.update_xaxes(zeroline=True, zerolinecolor=style.INK, zerolinewidth=1.2)
+    return figure.update_xaxes(title_font_size=11.5, title_font_color=style.QUIET)
+
+
+def _draw_differences(
+    figure: go.Figure, differences: Sequence[Difference], controllers: Sequence[int], row: int, column: int
+) -> None:
+    """One panel: a dot and its interval per controller; what is infinite stands as a triangle at the edge."""
+    _, scale = unit(differences[0].metric)
+    ends = np.array([[one.low, one.median, one.high] for one in differences]) * scale
+    known = np.append(ends[np.isfinite(ends)], 0.0)
+    spread = float(np.ptp(known)) or 1.0
+    left, right = float(known.min()) - 0.18 * spread, float(known.max()) + 0.18 * spread
+    place: dict[str, Any] = {"row": row, "col": column}
+    for height, (controller, difference, three) in enumerate(zip(controllers, differences, ends, strict=True)):
+        low, middle, high = np.clip(three, left, right)
+        colour = style.colour(controller)
+        symbol = "circle" if np.isfinite(three[1]) else f"triangle-{'right' if three[1] > 0 else 'left'}"
+        bar = go.Scatter(
+            x=[low, high],
+            y=[height, height],
+            mode="lines",
+            line={"color": colour, "width": 3},
+            hoverinfo="skip",
+            meta=controller,
+        )
+        dot = go.Scatter(
+            x=[middle],
+            y=[height],
+            mode="markers",
+            marker={"color": colour, "size": 10, "symbol": symbol, "line": {"color": "white", "width": 1}},
+            cliponaxis=False,
+            hovertemplate=_told(difference, three),
+            meta=controller,
+        )
+        figure.add_traces([bar, dot], rows=row, cols=column)
+    figure.update_xaxes(range=[left, right], **place)
+
+
+def _told(difference: Difference, ends: Float[np.ndarray, "3"]) -> str:
+    """What a dot says when it is pointed at."""
+    low, middle, high = (f"{end:.4g}" for end in ends)
+    return (
+        f"{middle} ({low} to {high})<br>smaller in {difference.better}, larger in {difference.worse}, "
+        f"equal in {difference.tied}, left out {difference.left_out}"
+    )
+
+
+def _finish(
+    figure: go.Figure, names: Sequence[str], controllers: Sequence[int], height: int, **layout: Any
+) -> go.Figure:
+    """The figure in the house style, every trace named after its controller, and a legend of the controllers above it.
+
+    The legend has entries of its own, since a controller may have nothing to draw in a panel.
+    """
+    texts = [f"<b>{number}</b> {label(name)}" for number, name in enumerate(names, start=1)]
+    figure.for_each_trace(lambda trace: trace.update(name=texts[trace.meta], legendgroup=str(trace.meta), meta=None))
+    figure.update_traces(showlegend=False)
+    for controller in controllers:
+        marker = {"color": style.colour(controller), "symbol": "square", "size": 11}
+        entry = go.Scatter(x=[None], y=[None], mode="markers", marker=marker, name=texts[controller], hoverinfo="skip")
+        figure.add_trace(entry.update(legendgroup=str(controller)))
+    margin = {"l": 66, "r": 14, "t": style.room_for_names(len(controllers)), "b": 48}
+    figure = style.frame(figure, height + margin["t"] + margin["b"], margin=margin, **layout)
+    figure.update_annotations(font_size=11.5)  # titles of four panels side by side
+    return style.legend_below_tools(figure)

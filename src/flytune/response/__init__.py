@@ -1,1 +1,0 @@
-"""How a flight is judged: trials are flown, measured and summarised, whoever the pilot was."""

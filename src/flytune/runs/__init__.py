@@ -1,0 +1,1 @@
+"""Run directories, the policies that ship, and controllers by name."""

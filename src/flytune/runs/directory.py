@@ -1,0 +1,194 @@
+"""Run directories: what a training leaves behind, and what it needs to go on (docs/definitions.md)."""
+
+import json
+import os
+import platform
+import subprocess
+import sys
+import time
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+import safetensors
+import safetensors.numpy
+
+from flytune.config import document
+from flytune.control.policy import Policy, save_policy
+from flytune.errors import BadInput
+from flytune.task.task import Task, load_task, write_task
+
+
+def new_directory(task: Task, trainer: str, seed: int, parent: Path = Path("runs")) -> Path:
+    """A directory that does not exist yet, named after the training and numbered where the name is taken."""
+    base = parent / f"{task.name}-{trainer}-s{seed}"
+    path, number = base, 2
+    while path.exists():
+        path, number = base.with_name(f"{base.name}-{number}"), number + 1
+    return path
+
+
+class RunDirectory:
+    """The files of one run; what is written is whole or absent."""
+
+    def __init__(self, path: Path, task: Task, trainer: str, seed: int, resume: bool) -> None:
+        self.path = path
+        if path.exists() and not path.is_dir():
+            raise BadInput(f"out: {path} is a file. Give a directory that does not exist yet.")
+        holds_run = (path / "run.json").exists()
+        if resume:
+            self._check_same(task, trainer, seed, holds_run)
+            return
+        if holds_run:
+            raise BadInput(f"out: {path} already holds a run. Give another directory, or --resume to go on with it.")
+        try:
+            path.mkdir(parents=True, exist_ok=True)
+            write_text(path / "task.toml", write_task(task))
+            self._write_facts(_facts(task, trainer, seed))
+        except OSError as error:
+            raise BadInput(f"out: {path} cannot be written ({error.strerror}). Give another directory.") from None
+
+    def _check_same(self, task: Task, trainer: str, seed: int, holds_run: bool) -> None:
+        if not holds_run:
+            raise BadInput(f"resume: {self.path} holds no run. Leave out --resume to start one.")
+        facts = read_facts(self.path)
+        if (facts.get("trainer"), facts.get("seed")) != (trainer, seed):
+            raise BadInput(
+                f"resume: {self.path} was trained with {facts.get('trainer')}, seed {facts.get('seed')}, "
+                f"not {trainer}, seed {seed}. Give the same, or another directory."
+            )
+        before, now = document.plain(load_task(self.path / "task.toml")), document.plain(task)
+        if path := first_difference(before, now):
+            raise BadInput(
+                f"resume: {self.path} was trained with another {path}. Give {self.path}/task.toml as the task."
+            )
+        if not (self.path / "checkpoint" / "learner.safetensors").exists():
+            raise BadInput(f"resume: {self.path} holds no checkpoint. Train again into another directory.")
+
+    def checkpoint(self, train_state: Any, rows: list[dict[str, Any]]) -> None:
+        """Write everything that is needed to go on exactly, and the metrics up to here."""
+        folder = self.path / "checkpoint"
+        folder.mkdir(exist_ok=True)
+        leaves = {f"{index:03d}": np.asarray(_raw(leaf)) for index, leaf in enumerate(jax.tree.leaves(train_state))}
+        whole = folder / "learner.safetensors.part"
+        safetensors.numpy.save_file(leaves, whole, metadata={"rows": json.dumps(rows)})
+        whole.replace(folder / "learner.safetensors")
+        write_text(self.path / "metrics.jsonl", "".join(json.dumps(row) + "\n" for row in rows))
+
+    def resume(self, fresh: Any) -> tuple[Any, list[dict[str, Any]]]:
+        """The learner and the metrics of the checkpoint; `fresh` says what the learner is made of."""
+        path = self.path / "checkpoint" / "learner.safetensors"
+        try:
+            with safetensors.safe_open(path, framework="numpy") as file:
+                stored = [file.get_tensor(name) for name in sorted(file.keys())]
+                rows = json.loads((file.metadata() or {})["rows"])
+        except (safetensors.SafetensorError, OSError, KeyError, ValueError) as error:
+            raise BadInput(f"resume: {path} is damaged ({error}). Train again into another directory.") from None
+        leaves, structure = jax.tree.flatten(fresh)
+        shapes = [np.shape(_raw(leaf)) for leaf in leaves]
+        if shapes != [value.shape for value in stored]:
+            raise BadInput(f"resume: {path} is of another version of flytune. Train again into another directory.")
+        restored = [
+            jax.random.wrap_key_data(value) if _is_key(leaf) else jax.numpy.asarray(value)
+            for leaf, value in zip(leaves, stored, strict=True)
+        ]
+        return jax.tree.unflatten(structure, restored), rows
+
+    def finish(self, policy: Policy, last_policy: Policy, last: dict[str, Any]) -> None:
+        """Write the policies and say that the run is complete; `last` is the last row of the metrics."""
+        save_policy(self.path / "policy.safetensors", policy)
+        save_policy(self.path / "policy-last.safetensors", last_policy)
+        self._write_facts(
+            read_facts(self.path) | {"finished": True, "steps": last["steps"], "seconds": last["seconds"]}
+        )
+
+    def _write_facts(self, facts: dict[str, Any]) -> None:
+        write_text(self.path / "run.json", json.dumps(facts, indent=2) + "\n")
+
+
+def resume_command(path: Path, trainer: str, seed: int) -> str:
+    """What to type to go on with an interrupted run."""
+    return f"flytune train {path / 'task.toml'} --trainer {trainer} --seed {seed} --out {path} --resume"
+
+
+def read_facts(directory: Path) -> dict[str, Any]:
+    """The content of a run's run.json.
+
+    Raises:
+        BadInput: it is missing or damaged.
+    """
+    path = directory / "run.json"
+    try:
+        facts = json.loads(path.read_text(encoding="utf-8"))
+    except OSError:
+        raise BadInput(
+            f"{directory}: is not a run directory (no run.json). Give one that `flytune train` wrote."
+        ) from None
+    except ValueError:
+        raise BadInput(f"{path}: is damaged. Train again into another directory.") from None
+    if not isinstance(facts, dict) or not {"trainer", "seed", "versions", "machine", "command", "time"} <= set(facts):
+        raise BadInput(f"{path}: is damaged. Train again into another directory.")
+    return facts
+
+
+def _facts(task: Task, trainer: str, seed: int) -> dict[str, Any]:
+    packages = ["flytune", "jax", "jaxlib", "numpy", "optax"]
+    packages += ["stable_baselines3", "torch"] if trainer == "sb3" else []
+    return {
+        "task": task.name,
+        "trainer": trainer,
+        "seed": seed,
+        "command": [Path(sys.argv[0]).name, *sys.argv[1:]],
+        "time": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
+        "versions": {name: metadata.version(name) for name in packages} | {"python": platform.python_version()},
+        "machine": {"system": platform.system(), "processor": platform.machine(), "cores": os.cpu_count()},
+        "device": jax.devices()[0].platform,
+        "commit": _commit(),
+        "finished": False,
+    }
+
+
+def _commit() -> str | None:
+    """The commit flytune was run from, or None where it is not run from a checkout."""
+    here = Path(__file__).resolve()
+    environment = {name: value for name, value in os.environ.items() if not name.startswith("GIT_")}
+
+    def git(*arguments: str) -> str | None:
+        command = ["git", "-C", str(here.parent), *arguments]
+        try:
+            answer = subprocess.run(command, capture_output=True, text=True, timeout=5, check=False, env=environment)
+        except (OSError, subprocess.TimeoutExpired):
+            return None
+        return answer.stdout.strip() if answer.returncode == 0 else None
+
+    # a package installed inside somebody else's repository is not part of it
+    return git("rev-parse", "HEAD") if git("ls-files", "--error-unmatch", here.name) else None
+
+
+def first_difference(first: Any, second: Any, path: str = "") -> str | None:
+    """The path of the first value in which two nested tables differ, names and sources apart; None where none does."""
+    if isinstance(first, dict) and isinstance(second, dict):
+        for name in sorted(set(first) | set(second)):
+            if name in ("name", "sources"):
+                continue
+            if found := first_difference(first.get(name), second.get(name), f"{path}.{name}" if path else name):
+                return found
+        return None
+    return None if first == second else path
+
+
+def _is_key(leaf: Any) -> bool:
+    return jax.numpy.issubdtype(leaf.dtype, jax.dtypes.prng_key)
+
+
+def _raw(leaf: Any) -> Any:
+    return jax.random.key_data(leaf) if _is_key(leaf) else leaf
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write a text file, whole or not at all."""
+    whole = path.with_name(path.name + ".part")
+    whole.write_text(text, encoding="utf-8")
+    whole.replace(path)

@@ -1,0 +1,109 @@
+"""Controllers by name: what the command line's WHO stands for."""
+
+import dataclasses
+import json
+import os
+from pathlib import Path
+from typing import Any
+
+from flytune.control.classical import CLASSICAL, classical_controller
+from flytune.control.controller import Controller
+from flytune.control.policy import load_policy
+from flytune.errors import BadInput
+from flytune.export.untrusted.onnx_controller import load_onnx
+from flytune.export.untrusted.sb3_model import load_sb3
+from flytune.runs.directory import read_facts, resume_command
+from flytune.runs.shipped import shipped_files, shipped_names
+from flytune.task.task import Task, load_task, read_task_text
+
+READERS = {".safetensors": load_policy, ".onnx": load_onnx, ".zip": load_sb3}
+KINDS = f"a run directory, a policy file ({', '.join(READERS)}), {', '.join(CLASSICAL)}"
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class FoundController:
+    """A controller, the task it flies, and how it was made."""
+
+    name: str
+    controller: Controller
+    task: Task  # the one asked for, else the one it was trained for, else the baseline
+    metrics: list[dict[str, Any]] | None  # its training, one row per update
+    about: dict[str, str]  # facts for a reader
+
+
+def find_controller(name: str, task: str | Task | None = None) -> FoundController:
+    """The controller that a run directory, a policy file or the name of a classical controller stands for.
+
+    Args:
+        name: `runs/baseline-apg-s0`, `policy.safetensors`, `policy.onnx`, a Stable-Baselines3 model `model.zip`,
+            `pid`, `geometric` or `lqr` (gains tuned by search; `pid@textbook` for those of the books).
+        task: what it is to fly; its own, or the baseline, where None.
+
+    Raises:
+        BadInput: there is no such thing, or it cannot be used.
+    """
+    wanted = load_task(task) if isinstance(task, str) else task
+    path = Path(name)
+    if os.path.isdir(name):  # unlike Path.is_dir, also where the name is too long to be one
+        return _from_run(name, path, wanted)
+    if path.suffix in READERS or os.path.isfile(name):
+        return _from_file(name, path, wanted)
+    kind, at, gains = name.partition("@")
+    if kind in CLASSICAL:
+        flown = wanted or load_task("baseline")
+        controller = classical_controller(kind, flown, gains if at else "tuned")
+        about = {"controller": kind, "gains": gains or "tuned"}
+        return FoundController(name=name, controller=controller, task=flown, metrics=None, about=about)
+    if name in shipped_names():
+        return _shipped(name, wanted)
+    raise BadInput(f"{name}: no such controller. Allowed: {KINDS}{''.join(f', {name}' for name in shipped_names())}.")
+
+
+def _from_file(name: str, path: Path, wanted: Task | None) -> FoundController:
+    policy = READERS.get(path.suffix, load_policy)(path)
+    about = {key: str(value) for key, value in policy.about.items() if key != "task_toml"}
+    text = policy.about.get("task_toml")
+    task = wanted or (read_task_text(text, name) if text else load_task("baseline"))
+    return FoundController(name=name, controller=policy, task=task, metrics=None, about=about)
+
+
+def _shipped(name: str, wanted: Task | None) -> FoundController:
+    path, record = shipped_files(name)
+    facts = json.loads(record.read_text(encoding="utf-8"))
+    controller = _from_file(name, path, wanted)
+    return dataclasses.replace(
+        controller, about=controller.about | {"trained": facts["time"], "commit": str(facts["commit"])}
+    )
+
+
+def _from_run(name: str, path: Path, wanted: Task | None) -> FoundController:
+    facts = read_facts(path)
+    if not (path / "policy.safetensors").exists():
+        begun = (path / "checkpoint" / "learner.safetensors").exists()
+        remedy = f"Go on with: {resume_command(path, facts['trainer'], facts['seed'])}" if begun else "Train it again."
+        raise BadInput(f"{name}: its training has not ended. {remedy}")
+    policy = load_policy(path / "policy.safetensors")
+    about = {
+        "trainer": f"{facts['trainer']}, seed {facts['seed']}",
+        "environment steps": str(facts.get("steps", 0)),
+        "training time": f"{facts.get('seconds', 0)} s",
+        "machine": ", ".join(f"{name} {value}" for name, value in dict(facts["machine"]).items()),
+        "versions": ", ".join(f"{name} {version}" for name, version in dict(facts["versions"]).items()),
+        "command": " ".join(map(str, facts["command"])),
+        "started": facts["time"],
+    }
+    metrics = _read_metrics(path / "metrics.jsonl")
+    task = wanted or load_task(path / "task.toml")
+    return FoundController(name=name, controller=policy, task=task, metrics=metrics, about=about)
+
+
+def _read_metrics(path: Path) -> list[dict[str, Any]] | None:
+    if not path.exists():
+        return None
+    try:
+        rows = [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
+        if not all(isinstance(row, dict) for row in rows):
+            raise ValueError("a line is no object")
+    except (OSError, ValueError) as error:
+        raise BadInput(f"{path}: is damaged ({error}). Remove it to go without the learning curve.") from None
+    return rows

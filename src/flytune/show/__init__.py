@@ -1,1 +1,0 @@
-"""Showing: judged flights become figures and one page to read."""

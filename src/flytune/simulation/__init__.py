@@ -1,0 +1,1 @@
+"""Simulators behind one protocol, the environment, and the rollout that steps it."""

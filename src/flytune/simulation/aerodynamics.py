@@ -1,0 +1,48 @@
+"""What air does to a small quadrotor beyond thrust, as the paper's simulator models it. NumPy, float64."""
+
+import numpy as np
+from jaxtyping import Float
+
+from flytune.physics.vehicle import Vehicle
+from flytune.simulation.actuator import SIDE
+from flytune.simulation.simulator import rotation_matrix, to_body, to_inertial
+
+GROUND_EFFECT_COEFFICIENT = 11.36859  # 1; gym-pybullet-drones (MIT licence), cf2x.urdf: gnd_eff_coeff
+LARGEST_GROUND_EFFECT = (
+    4 / 15
+)  # of the thrust; what gym-pybullet-drones' lowest height, r sqrt(15 k / 4) / 4, amounts to
+ROTOR_DRAG = np.array([9.1785e-7, 9.1785e-7, 10.311e-7])  # kg/rad; Forster 2015, Crazyflie 2.0, body axes
+RAD_PER_S = 2 * np.pi / 60  # of one rpm
+
+
+def ground_effect(
+    vehicle: Vehicle, position: Float[np.ndarray, "N 3"], attitude: Float[np.ndarray, "N 4"]
+) -> Float[np.ndarray, "N 4"]:
+    """By which share each propeller's thrust grows above a floor at z = 0.
+
+        gain = min(4 / 15, k (r / 4 h)^2),  h the height of the propeller, r its radius
+
+    No gain on the back. There is no floor to hit: below it the gain stays at its largest.
+
+    Source: Panerati et al., Learning to Fly, IROS 2021, after Shi et al., Neural Lander, ICRA 2019; k and the lowest
+    height as in gym-pybullet-drones.
+    """
+    upwards = rotation_matrix(attitude)[:, 2]
+    height = position[:, 2:] + vehicle.lever * upwards[:, :2] @ SIDE.T
+    lowest = vehicle.propeller_radius / 4 * np.sqrt(GROUND_EFFECT_COEFFICIENT / LARGEST_GROUND_EFFECT)
+    gain = GROUND_EFFECT_COEFFICIENT * (vehicle.propeller_radius / (4 * np.maximum(height, lowest))) ** 2
+    return np.where(upwards[:, 2:] > 0, gain, 0.0)
+
+
+def rotor_drag(
+    attitude: Float[np.ndarray, "N 4"],
+    velocity: Float[np.ndarray, "N 3"],
+    rotor_speed_rpm: Float[np.ndarray, "N 4"],
+) -> Float[np.ndarray, "N 3"]:
+    """The drag of turning propellers in N, inertial frame: -K (sum of rotor speeds) v, K along the body's axes.
+
+    Source: Forster, System Identification of the Crazyflie 2.0 Nano Quadrocopter, ETH Zurich 2015; coefficients as in
+    gym-pybullet-drones' cf2x.urdf, which applies them along the inertial axes instead.
+    """
+    turning = RAD_PER_S * rotor_speed_rpm.sum(axis=-1, keepdims=True)
+    return to_inertial(attitude, -ROTOR_DRAG * turning * to_body(attitude, velocity))

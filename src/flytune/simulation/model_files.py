@@ -1,0 +1,114 @@
+"""A vehicle as the files other simulators read: URDF and MJCF, with every number in full."""
+
+from collections.abc import Iterable
+from typing import Literal
+
+from flytune.physics.dynamics import CONTROL_PERIOD
+from flytune.physics.vehicle import Vehicle
+from flytune.simulation.actuator import SIDE, SPIN
+
+Integrator = Literal["RK4", "Euler", "implicit", "implicitfast"]
+
+THICKNESS = 2e-3  # m, of what is drawn; it is neither weighed nor touched
+
+
+def urdf(vehicle: Vehicle) -> str:
+    """The vehicle as URDF: one link with mass and inertia, drawn with a disc at each motor.
+
+    It has no collision shapes, and URDF knows neither rotors nor drag: the forces are left to the caller.
+    """
+    ixx, iyy, izz = map(float, vehicle.inertia)
+    discs = "".join(
+        f"""
+    <visual>
+      <origin xyz="{place}" rpy="0 0 0"/>
+      <geometry>
+        <cylinder radius="{float(vehicle.propeller_radius)!r}" length="{THICKNESS}"/>
+      </geometry>
+    </visual>"""
+        for place in _motor_places(vehicle)
+    )
+    return f"""<?xml version="1.0"?>
+<robot name="{_name(vehicle)}">
+  <link name="body">
+    <inertial>
+      <origin xyz="0 0 0" rpy="0 0 0"/>
+      <mass value="{float(vehicle.mass)!r}"/>
+      <inertia ixx="{ixx!r}" iyy="{iyy!r}" izz="{izz!r}" ixy="0" ixz="0" iyz="0"/>
+    </inertial>
+    <visual>
+      <geometry>
+        <box size="{vehicle.lever!r} {vehicle.lever!r} {THICKNESS}"/>
+      </geometry>
+    </visual>{discs}
+  </link>
+</robot>
+"""
+
+
+def mjcf(vehicle: Vehicle, *, timestep: float = CONTROL_PERIOD / 2, integrator: Integrator = "RK4") -> str:
+    """The vehicle as MJCF: a free body, a site at each motor, and an actuator on it whose control is thrust in N.
+
+    A motor's torque about z comes with its thrust, km / kf times as large. Rotor lag and latency are left to the
+    caller, and so is drag, for which a free joint has one coefficient where a vehicle has three.
+
+    Args:
+        vehicle: what is described.
+        timestep: of the physics, s.
+        integrator: by MuJoCo's names.
+    """
+    ratio = float(vehicle.torque_coefficient / vehicle.thrust_coefficient)
+    strongest = float(vehicle.thrust_coefficient * vehicle.maximum_rotor_speed_rpm**2)
+    disc = f"{float(vehicle.propeller_radius)!r} {THICKNESS / 2}"
+    sites = "".join(
+        f"""
+      <site name="motor{motor}" pos="{place}"/>
+      <geom type="cylinder" size="{disc}" pos="{place}" rgba="0.3 0.3 0.3 0.6"/>"""
+        for motor, place in enumerate(_motor_places(vehicle))
+    )
+    motors = "".join(
+        f"""
+    <motor name="motor{motor}" site="motor{motor}" gear="0 0 1 0 0 {float(spin) * ratio!r}" ctrllimited="true"
+           ctrlrange="0 {strongest!r}"/>"""
+        for motor, spin in enumerate(SPIN)
+    )
+    return f"""<mujoco model="{_name(vehicle)}">
+  <compiler angle="radian" inertiafromgeom="false"/>
+  <option timestep="{timestep!r}" integrator="{integrator}" gravity="0 0 {-float(vehicle.gravity)!r}"
+          density="0" viscosity="0">
+    <flag autoreset="disable"/>
+  </option>
+  <default>
+    <geom contype="0" conaffinity="0" mass="0"/>
+  </default>
+  <worldbody>
+    <light pos="0 0 4"/>
+    <body name="body">
+      <freejoint name="free"/>
+      <inertial pos="0 0 0" mass="{float(vehicle.mass)!r}" diaginertia="{_numbers(vehicle.inertia)}"/>
+      <geom type="box" size="{vehicle.lever / 2!r} {vehicle.lever / 2!r} {THICKNESS}" rgba="0.2 0.4 0.7 1"/>{sites}
+    </body>
+  </worldbody>
+  <actuator>{motors}
+  </actuator>
+</mujoco>
+"""
+
+
+def motor_positions(vehicle: Vehicle) -> list[list[float]]:
+    """Where the four motors sit in the body frame, m (paper R4)."""
+    lever = float(vehicle.lever)
+    return [[float(x) * lever, float(y) * lever, 0.0] for x, y in SIDE]
+
+
+def _motor_places(vehicle: Vehicle) -> list[str]:
+    return [_numbers(place) for place in motor_positions(vehicle)]
+
+
+def _numbers(values: Iterable[float]) -> str:
+    return " ".join(repr(float(value)) for value in values)
+
+
+def _name(vehicle: Vehicle) -> str:
+    """The vehicle's name, as far as XML takes it unquoted."""
+    return "".join(c for c in vehicle.name if c.isalnum() or c in " -_.@") or "vehicle"

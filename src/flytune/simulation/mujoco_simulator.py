@@ -1,0 +1,85 @@
+"""MuJoCo as a world: the vehicle's MJCF, stepped for all vehicles at once."""
+
+from typing import Annotated
+
+import numpy as np
+from annotated_types import Ge, Le, Unit
+
+from flytune.config.document import Whole
+from flytune.config.pytree import pytree, static
+from flytune.extras import require
+from flytune.physics.dynamics import CONTROL_PERIOD
+from flytune.physics.vehicle import Vehicle
+from flytune.simulation.actuator import Actuator
+from flytune.simulation.model_files import Integrator, mjcf
+from flytune.simulation.simulator import VehicleStates
+
+POSITION, ATTITUDE = slice(1, 4), slice(4, 8)  # in MuJoCo's state (time, qpos, qvel) of one free body
+VELOCITY, BODY_RATE = slice(8, 11), slice(11, 14)
+W_FIRST, W_LAST = [3, 0, 1, 2], [1, 2, 3, 0]  # MuJoCo writes quaternions (w, x, y, z)
+
+
+@pytree
+class MujocoOptions:
+    """How the motion is integrated, and how finely."""
+
+    physics_steps: Annotated[Whole, Ge(1), Le(100), Unit("per control period")] = static(default=2)
+    integrator: Integrator = static(default="RK4")
+
+
+class MujocoSimulator:
+    """N vehicles as N states of one MuJoCo model, in float64.
+
+    A free joint's velocity is inertial and its angular velocity is of the body, as flytune has them. The vehicle's
+    drag is set as damping on the three directions of the joint, so that MuJoCo's integrators know of it.
+    """
+
+    def __init__(self, vehicle: Vehicle, number: int, options: MujocoOptions) -> None:
+        """The compiled model, and the vehicles at its origin.
+
+        Raises:
+            BadInput: MuJoCo is not installed.
+        """
+        mujoco, self._rollout = require("mujoco", "mujoco"), require("mujoco.rollout", "mujoco")
+        self._vehicle, self._options = vehicle, options
+        self._period = CONTROL_PERIOD / options.physics_steps
+        text = mjcf(vehicle, timestep=self._period, integrator=options.integrator)
+        self._model = mujoco.MjModel.from_xml_string(text)
+        self._model.dof_damping[:3] = vehicle.drag
+        self._data = mujoco.MjData(self._model)
+        self._actuator = Actuator(vehicle, number)
+        self._state = np.zeros((number, mujoco.mj_stateSize(self._model, mujoco.mjtState.mjSTATE_FULLPHYSICS)))
+        self._state[:, ATTITUDE] = 1.0, 0.0, 0.0, 0.0
+
+    def place(self, body: VehicleStates, which: np.ndarray | None = None) -> None:
+        """Put the vehicles there, see `World`."""
+        chosen = slice(None) if which is None else which
+        self._state[chosen, POSITION] = body.position
+        self._state[chosen, ATTITUDE] = body.attitude[:, W_FIRST]
+        self._state[chosen, VELOCITY] = body.velocity
+        self._state[chosen, BODY_RATE] = body.body_rate
+        self._actuator.place(body.rotor_speed_rpm, which)
+
+    def advance(self, action: np.ndarray) -> None:
+        """Let one control period pass, see `World`."""
+        self._actuator.command(action)
+        speeds = [self._actuator.turn(self._period) for _ in range(self._options.physics_steps)]
+        thrust = self._vehicle.thrust_coefficient * np.stack(speeds, axis=1) ** 2
+        self._state[:, 0] = 0.0  # time, on which nothing depends
+        states, _ = self._rollout.rollout(self._model, self._data, self._state, thrust)
+        self._state = np.array(states[:, -1])
+
+    def body(self) -> VehicleStates:
+        """Where the vehicles are, see `World`."""
+        state = self._state
+        return VehicleStates(
+            position=state[:, POSITION].copy(),
+            attitude=state[:, ATTITUDE][:, W_LAST],
+            velocity=state[:, VELOCITY].copy(),
+            body_rate=state[:, BODY_RATE].copy(),
+            rotor_speed_rpm=self._actuator.rotor_speed_rpm.copy(),
+        )
+
+    def close(self) -> None:
+        """Let go of the model; a second call does nothing."""
+        self._model = self._data = None

@@ -1,0 +1,145 @@
+"""PyBullet as a world: the paper's simulator (paper R6), with a force at each motor."""
+
+import tempfile
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+from annotated_types import Ge, Le, Unit
+
+from flytune.config.document import Real, Whole
+from flytune.config.pytree import pytree, static
+from flytune.errors import BadInput
+from flytune.extras import require
+from flytune.physics.dynamics import CONTROL_PERIOD
+from flytune.physics.vehicle import Vehicle
+from flytune.simulation.actuator import SPIN, Actuator
+from flytune.simulation.aerodynamics import ground_effect, rotor_drag
+from flytune.simulation.model_files import motor_positions, urdf
+from flytune.simulation.simulator import VehicleStates, to_body, to_inertial
+
+BODY = -1  # PyBullet's index of a vehicle's base link
+
+
+@pytree
+class PyBulletOptions:
+    """What is simulated beyond rigid bodies under thrust, and how finely."""
+
+    physics_steps: Annotated[Whole, Ge(1), Le(100), Unit("per control period")] = static(default=2)
+    # slows a free body by damping * (1 + |v|) * v, and its rotation alike; Bullet's own default is 0.04
+    damping: Annotated[Real, Ge(0), Le(1), Unit("1/s")] = 0.0
+    ground_effect: bool = static(default=False)  # propellers near a floor at z = 0 push harder
+    rotor_drag: bool = static(default=False)  # turning propellers are slowed by the air they move through
+
+
+class PyBulletSimulator:
+    """N vehicles in one PyBullet client, without collisions, in float64.
+
+    Bullet keeps the angular velocity in the inertial frame; it is turned into the body frame here. Its multibody
+    solver, which URDF files are loaded into, has the gyroscopic torque, advances velocities first and positions with
+    them (semi-implicit Euler, first order), and forgets forces after each step. docs/worlds.md measures all of these.
+    """
+
+    def __init__(self, vehicle: Vehicle, number: int, options: PyBulletOptions) -> None:
+        """An open client with the vehicles in it, all at the origin.
+
+        Raises:
+            BadInput: PyBullet is not installed, or too many of its clients are open.
+        """
+        self._bullet = require("pybullet", "pybullet")
+        self._vehicle, self._options = vehicle, options
+        self._period = CONTROL_PERIOD / options.physics_steps
+        self._actuator = Actuator(vehicle, number)
+        self._motors = motor_positions(vehicle)
+        self._drag = np.array(vehicle.drag, float)
+        self._client = self._bullet.connect(self._bullet.DIRECT)
+        if self._client < 0:
+            raise BadInput("pybullet: no client is left. Close a world that is no longer needed.")
+        self._bullet.setGravity(0, 0, -float(vehicle.gravity), physicsClientId=self._client)
+        self._bullet.setTimeStep(self._period, physicsClientId=self._client)
+        self._vehicles = self._load(number)
+
+    def _load(self, number: int) -> list[int]:
+        """PyBullet's numbers of the vehicles."""
+        bullet, client = self._bullet, self._client
+        with tempfile.TemporaryDirectory() as folder:
+            file = Path(folder) / "vehicle.urdf"
+            file.write_text(urdf(self._vehicle), encoding="utf-8")
+            flags = bullet.URDF_USE_INERTIA_FROM_FILE  # else Bullet works one out from the collision shape
+            vehicles = [bullet.loadURDF(str(file), flags=flags, physicsClientId=client) for _ in range(number)]
+        for vehicle in vehicles:
+            bullet.changeDynamics(
+                vehicle,
+                BODY,
+                linearDamping=float(self._options.damping),
+                angularDamping=float(self._options.damping),
+                activationState=bullet.ACTIVATION_STATE_DISABLE_SLEEPING,
+                physicsClientId=client,
+            )
+        return vehicles
+
+    def place(self, body: VehicleStates, which: np.ndarray | None = None) -> None:
+        """Put the vehicles there, see `World`."""
+        chosen = range(len(self._vehicles)) if which is None else which
+        turning = to_inertial(np.asarray(body.attitude, float), np.asarray(body.body_rate, float))
+        for row, index in enumerate(chosen):
+            vehicle = self._vehicles[int(index)]
+            self._bullet.resetBasePositionAndOrientation(
+                vehicle, body.position[row].tolist(), body.attitude[row].tolist(), physicsClientId=self._client
+            )
+            self._bullet.resetBaseVelocity(
+                vehicle, body.velocity[row].tolist(), turning[row].tolist(), physicsClientId=self._client
+            )
+        self._actuator.place(body.rotor_speed_rpm, which)
+
+    def advance(self, action: np.ndarray) -> None:
+        """Let one control period pass, see `World`."""
+        self._actuator.command(action)
+        for _ in range(self._options.physics_steps):
+            self._push(self._actuator.turn(self._period))
+            self._bullet.stepSimulation(physicsClientId=self._client)
+
+    def _push(self, rotor_speed_rpm: np.ndarray) -> None:
+        """Apply the forces of a physics step: a thrust at each motor, their torque about z, and what the air does."""
+        bullet, client, frame = self._bullet, self._client, self._bullet.LINK_FRAME
+        squared = rotor_speed_rpm**2
+        thrust = self._vehicle.thrust_coefficient * squared
+        if self._options.ground_effect or self._options.rotor_drag or self._drag.any():
+            thrust = self._resist(rotor_speed_rpm, thrust)
+        twist = self._vehicle.torque_coefficient * squared @ SPIN
+        for vehicle, forces, torque in zip(self._vehicles, thrust.tolist(), twist.tolist(), strict=True):
+            for motor, force in zip(self._motors, forces, strict=True):
+                bullet.applyExternalForce(vehicle, BODY, (0, 0, force), motor, frame, client)
+            bullet.applyExternalTorque(vehicle, BODY, (0, 0, torque), frame, client)
+
+    def _resist(self, rotor_speed_rpm: np.ndarray, thrust: np.ndarray) -> np.ndarray:
+        """The thrusts with ground effect; drag is applied on the way."""
+        body = self.body()
+        drag = -self._drag * body.velocity
+        if self._options.rotor_drag:
+            drag += rotor_drag(body.attitude, body.velocity, rotor_speed_rpm)
+        for vehicle, force, place in zip(self._vehicles, drag.tolist(), body.position.tolist(), strict=True):
+            self._bullet.applyExternalForce(vehicle, BODY, force, place, self._bullet.WORLD_FRAME, self._client)
+        if not self._options.ground_effect:
+            return thrust
+        return thrust * (1 + ground_effect(self._vehicle, body.position, body.attitude))
+
+    def body(self) -> VehicleStates:
+        """Where the vehicles are, see `World`."""
+        bullet, client = self._bullet, self._client
+        places = [bullet.getBasePositionAndOrientation(vehicle, client) for vehicle in self._vehicles]
+        motions = np.array([bullet.getBaseVelocity(vehicle, client) for vehicle in self._vehicles])
+        attitude = np.array([attitude for _, attitude in places])
+        return VehicleStates(
+            position=np.array([position for position, _ in places]),
+            attitude=attitude,
+            velocity=motions[:, 0],
+            body_rate=to_body(attitude, motions[:, 1]),
+            rotor_speed_rpm=self._actuator.rotor_speed_rpm.copy(),
+        )
+
+    def close(self) -> None:
+        """Disconnect; a second call does nothing."""
+        if self._client >= 0:
+            self._bullet.disconnect(physicsClientId=self._client)
+            self._client = -1

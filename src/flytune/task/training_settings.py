@@ -1,0 +1,83 @@
+"""Trainer settings: how a task is learned, kept beside what is learned so that one file says all (paper R16 to R18)."""
+
+import math
+from typing import Annotated
+
+from annotated_types import Ge, Gt, Le, Lt, Unit
+
+from flytune.config.document import Real, Whole
+from flytune.config.pytree import pytree
+from flytune.task.initial_state import InitialState
+
+Share = Annotated[Real, Ge(0), Le(1), Unit("1")]
+Positive = Annotated[Real, Gt(0), Unit("1")]
+Count = Annotated[Whole, Ge(1), Le(1_000_000)]
+
+
+@pytree
+class PpoSettings:
+    """Proximal policy optimisation (Schulman et al. 2017), by default the paper's (R16 to R18)."""
+
+    steps: Annotated[Whole, Ge(1), Unit("environment steps")] = 6_000_000  # R18
+    environments: Count = 128  # reading of R18: 128 x 128 gives the samples of 4 x 4096
+    rollout: Annotated[Whole, Ge(1), Le(1_000_000), Unit("steps per environment")] = 128
+    epochs: Count = 12  # R17
+    minibatch: Annotated[Whole, Ge(2), Unit("samples")] = 128  # R17
+    learning_rate: Annotated[Real, Gt(0), Unit("1")] = 2e-4  # R17
+    clip: Annotated[Real, Gt(0), Lt(1), Unit("1")] = 0.15  # R17
+    discount: Annotated[Real, Gt(0), Le(1), Unit("1")] = 0.99  # R17: Stable-Baselines3
+    gae_lambda: Share = 0.95
+    value_weight: Annotated[Real, Ge(0), Unit("1")] = 0.5
+    entropy_weight: Annotated[Real, Ge(0), Unit("1")] = 0.0
+    max_grad_norm: Annotated[Real, Gt(0), Unit("1")] = 0.5
+    clip_apart: bool = False  # actor and critic each get their own max_grad_norm, so that neither drowns the other
+    final_learning_rate: Share = 1.0  # as a share of the first, reached along a line
+    input_scale: tuple[Positive, Positive, Positive, Positive, Positive] = (1.0, 1.0, 1.0, 1.0, 1.0)  # per block of R7
+    initial_log_std: Annotated[Real, Unit("1")] = 0.0
+    hidden: tuple[Count, ...] = (64, 64)  # R16
+    ema_decay: Annotated[Real, Ge(0), Lt(1), Unit("1 per update")] = 0.95  # weights kept from before, flown policy
+
+    def problem(self) -> str | None:
+        """What makes the numbers impossible together, or None."""
+        samples = self.environments * self.rollout
+        if samples % self.minibatch:
+            return (
+                f"minibatch: {self.minibatch} does not divide environments * rollout = {samples}. Allowed: a divisor."
+            )
+        return None
+
+    @property
+    def updates(self) -> int:
+        """How many updates the steps make."""
+        return math.ceil(self.steps / (self.environments * self.rollout))
+
+
+@pytree
+class ApgSettings:
+    """Analytic policy gradient: gradient ascent on the reward, through the simulator (our own; not in the paper).
+
+    It trains from its own, wider starts: a policy that keeps the speed bound from 2 m away has to have been there.
+    """
+
+    initial_state: InitialState = InitialState(
+        lowest_position=(-2.0, -2.0, 0.1),
+        highest_position=(2.0, 2.0, 2.0),
+        largest_tilt=0.27,
+        largest_yaw=math.pi,
+    )
+    updates: Count = 300
+    environments: Count = 64
+    window: Annotated[Whole, Ge(1), Le(1_000_000), Unit("steps")] = 250  # what one gradient looks through
+    learning_rate: Annotated[Real, Gt(0), Unit("1")] = 5e-3
+    final_learning_rate: Share = 0.02  # as a share of the first, reached by a cosine
+    adam_b1: Annotated[Real, Ge(0), Lt(1), Unit("1")] = 0.7  # Adam's b1
+    adam_b2: Annotated[Real, Ge(0), Lt(1), Unit("1")] = 0.95  # Adam's b2
+    max_grad_norm: Annotated[Real, Gt(0), Unit("1")] = 1.0
+    barrier_weight: Annotated[Real, Ge(0), Unit("1")] = 30.0
+    barrier_margin: Annotated[Real, Ge(0), Lt(1), Unit("1")] = 0.1  # the barrier begins where less than this is left
+    termination_slack: Annotated[Real, Ge(0), Unit("1")] = (
+        0.0  # an episode goes on until a bound is passed by this share of it
+    )
+    input_scale: tuple[Positive, Positive, Positive, Positive, Positive] = (2.0, 3.0, 2.0, 0.3, 1.0)  # per block of R7
+    hidden: tuple[Count, ...] = (64, 64)
+    ema_decay: Annotated[Real, Ge(0), Lt(1), Unit("1 per update")] = 0.95

@@ -1,0 +1,1 @@
+"""Trainers: proximal policy optimisation and the gradient of the simulator."""

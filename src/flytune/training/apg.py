@@ -1,0 +1,161 @@
+"""Analytic policy gradient: gradient ascent on the reward, back-propagated through the differentiable simulator.
+
+One update flies `environments` episodes for `window` steps and differentiates their mean reward, without discount or
+critic, with respect to the actor's weights. Episodes carry over from update to update. The termination conditions act
+as a barrier on their margins, a smooth function where their end of an episode has no gradient.
+"""
+
+import dataclasses
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import optax
+from jaxtyping import Array, Float
+
+from flytune.config.pytree import pytree
+from flytune.control.policy import Network, Policy, make_network
+from flytune.errors import BadInput
+from flytune.simulation import environment
+from flytune.simulation.environment import Episode, Outcome
+from flytune.task.observation import NOISY, SIZE, input_scale
+from flytune.task.task import Task
+from flytune.task.termination import SAFE, cause
+from flytune.task.training_settings import ApgSettings
+from flytune.training.optimiser import averaged, descend
+from flytune.training.rollout_metrics import account
+
+
+@pytree
+class TrainState:
+    """Everything an update needs and changes."""
+
+    actor: Network
+    ema: Network  # exponential moving average of the actor over updates; the one that is flown
+    optimiser: Any
+    episodes: Episode  # a batch of them
+    key: Array
+    updates: Array
+
+
+def policy(settings: ApgSettings, train_state: TrainState) -> Policy:
+    """The policy that is flown: the averaged actor."""
+    return Policy(actor=train_state.ema, input_scale=input_scale(settings.input_scale), squash="tanh")
+
+
+def last_policy(settings: ApgSettings, train_state: TrainState) -> Policy:
+    """The policy of the last update."""
+    return Policy(actor=train_state.actor, input_scale=input_scale(settings.input_scale), squash="tanh")
+
+
+def _optimiser(settings: ApgSettings) -> optax.GradientTransformation:
+    rate = optax.cosine_decay_schedule(settings.learning_rate, settings.updates, settings.final_learning_rate)
+    return optax.chain(
+        optax.clip_by_global_norm(settings.max_grad_norm),
+        optax.adam(rate, b1=settings.adam_b1, b2=settings.adam_b2),
+    )
+
+
+@partial(jax.jit, static_argnames="settings")
+def start(task: Task, settings: ApgSettings, key: Array) -> TrainState:
+    """A learner before its first update."""
+    task = dataclasses.replace(task, initial_state=settings.initial_state)
+    actor_key, episode_key, key = jax.random.split(key, 3)
+    actor = make_network(actor_key, (SIZE, *settings.hidden, 4), last_gain=0.01)
+    keys = jax.random.split(episode_key, settings.environments)
+    episodes = jax.vmap(partial(environment.reset, task), out_axes=-1)(keys)
+    return TrainState(
+        actor=actor,
+        ema=actor,
+        optimiser=_optimiser(settings).init(actor),  # pyright: ignore[reportArgumentType]
+        episodes=episodes,
+        key=key,
+        updates=jnp.zeros((), jnp.int32),
+    )
+
+
+def barrier(margin: Float[Array, ""], settings: ApgSettings) -> Float[Array, ""]:
+    """What a margin costs: weight * max(0, barrier_margin - margin)^2, nothing while more than that is left."""
+    return settings.barrier_weight * jnp.maximum(settings.barrier_margin - margin, 0.0) ** 2
+
+
+def forgiven(task: Task, moved: Episode, outcome: Outcome, settings: ApgSettings) -> Outcome:
+    """The outcome of a training episode, which goes on until a margin is overdrawn by more than `settings.termination_slack`.
+
+    Where the episode ends at the bound itself, the gradient never sees what lies beyond: the barrier is then weakest
+    just where it is needed.
+    """
+    beyond = cause({name: margin + settings.termination_slack for name, margin in outcome.margins.items()})
+    terminated = beyond != SAFE
+    truncated = (moved.steps >= task.horizon) & ~terminated
+    return dataclasses.replace(outcome, cause=beyond, terminated=terminated, truncated=truncated)
+
+
+def go_on_from(settings: ApgSettings, train_state: TrainState, initial: Policy) -> TrainState:
+    """A learner before its first update whose actor flies as `initial` does, which saw other multiples of the inputs.
+
+    Raises:
+        BadInput: `initial` has other layers, or another squash.
+    """
+    shapes, wanted = ([weight.shape for weight in each.weights] for each in (initial.actor, train_state.actor))
+    if shapes != wanted or initial.squash != "tanh":
+        raise BadInput(
+            f"initial: a policy with layers {shapes} and squash {initial.squash} cannot be gone on from. "
+            f"Allowed: layers {wanted} and squash tanh, as trainer apg makes them."
+        )
+    first, *others = initial.actor.weights
+    ratio = initial.input_scale / input_scale(settings.input_scale)
+    actor = dataclasses.replace(initial.actor, weights=(first * ratio[:, None], *others))
+    actor = jax.tree.map(jnp.array, actor)  # copies: an update gives its learner's memory away
+    return dataclasses.replace(train_state, actor=actor, ema=jax.tree.map(jnp.array, actor))
+
+
+@partial(jax.jit, static_argnames="settings", donate_argnames="train_state")
+def update(task: Task, settings: ApgSettings, train_state: TrainState) -> tuple[TrainState, dict[str, Any]]:
+    """The learner after one update, and what it saw: reward, terms, terminations, lengths of finished episodes."""
+    key, flight_key = jax.random.split(train_state.key)
+    (_, (episodes, seen)), gradient = jax.value_and_grad(_loss, argnums=2, has_aux=True)(
+        task, settings, train_state.actor, train_state.episodes, flight_key
+    )
+    actor, optimiser = descend(_optimiser(settings), gradient, train_state.optimiser, train_state.actor)
+    seen["gradient_norm"] = optax.tree.norm(gradient)
+    after = TrainState(
+        actor=actor,
+        ema=averaged(train_state.ema, actor, settings.ema_decay, train_state.updates),
+        optimiser=optimiser,
+        episodes=episodes,
+        key=key,
+        updates=train_state.updates + 1,
+    )
+    return after, seen
+
+
+def _loss(task: Task, settings: ApgSettings, actor: Network, episodes: Episode, key: Array) -> Any:
+    """Mean cost per step of the whole batch, and the episodes it ends with.
+
+    The batch is the last axis: arithmetic on scalars per vehicle then runs along contiguous memory. Of the physics,
+    only the episodes between steps are kept for the gradient; what happens within a step is worked out again.
+    """
+    task = dataclasses.replace(task, initial_state=settings.initial_state)
+    scale = input_scale(settings.input_scale)
+
+    def one_step(episode: Episode, action: Array, reset_key: Array) -> Any:
+        moved, outcome = environment.step(task, episode, action)
+        cost = sum((barrier(margin, settings) for margin in outcome.margins.values()), start=jnp.zeros(()))
+        outcome = forgiven(task, moved, outcome, settings)
+        return environment.autoreset(task, moved, outcome, reset_key), (outcome.reward - cost, outcome, moved)
+
+    step = jax.checkpoint(jax.vmap(one_step, in_axes=-1, out_axes=-1), prevent_cse=False)
+    look = jax.checkpoint(jax.vmap(partial(environment.look, task), in_axes=-1, out_axes=0), prevent_cse=False)
+    noise_key, reset_key = jax.random.split(key)
+    noise = jax.random.normal(noise_key, (settings.window, NOISY, settings.environments))
+    reset_keys = jax.random.split(reset_key, (settings.window, settings.environments))
+
+    def advance(episodes: Episode, now: tuple[Array, Array]) -> Any:
+        normal, keys = now
+        action = jnp.tanh(actor(look(episodes, normal) * scale))
+        return step(episodes, action.T, keys)
+
+    episodes, (worth, outcome, moved) = jax.lax.scan(advance, episodes, (noise, reset_keys))
+    return -jnp.mean(worth), (episodes, {**account(task, outcome, moved), "objective": jnp.mean(worth)})

@@ -1,0 +1,296 @@
+"""The paper's own stack (R17): Stable-Baselines3's PPO, unchanged, on our environments and in our run directories.
+
+Everything that changes in a training lies in a `Learner` of plain arrays; Stable-Baselines3's model is a workbench that
+a learner is put on for one update and taken from again. So a checkpoint holds all there is, and a resumed training
+goes on bit by bit.
+"""
+
+# pyright: reportMissingImports=false
+# PyTorch is in no pinned requirement; without it the rest is checked all the same
+
+import contextlib
+import json
+import random
+from collections.abc import Iterator
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from flytune.adapters.batch import Transition
+from flytune.config.pytree import pytree, static
+from flytune.control.policy import Network, Policy
+from flytune.errors import BadInput, Diverged
+from flytune.export.untrusted.sb3_model import actor_network
+from flytune.extras import require
+from flytune.simulation.environment import Episode
+from flytune.task.observation import SIZE
+from flytune.task.task import Task
+from flytune.task.termination import causes
+from flytune.task.training_settings import PpoSettings
+from flytune.training.optimiser import averaged
+
+LOSSES = {  # our names -> what Stable-Baselines3 logs
+    "loss": "train/loss",
+    "policy_loss": "train/policy_gradient_loss",
+    "value_loss": "train/value_loss",
+    "clip_fraction": "train/clip_fraction",
+    "approximate_kl": "train/approx_kl",
+    "explained_variance": "train/explained_variance",
+    "std": "train/std",
+}
+
+# settings of our PPO that Stable-Baselines3's has not
+OURS_ALONE = ("clip_apart", "final_learning_rate", "input_scale")
+
+# what a Gaussian with numbers that are not finite, an overflowing step of Adam, and our environments are refused with
+REFUSALS = ("Expected parameter", "overflow", "not finite")
+
+
+@pytree
+class TrainState:
+    """Everything an update needs and changes."""
+
+    workbench: Any = static()  # the `_Workbench` that updates it; holds nothing that a learner does not
+    weights: dict[str, Any]  # of actor, critic and standard deviation, by torch's names
+    first_moments: dict[str, Any]  # Adam's, by the same names
+    second_moments: dict[str, Any]
+    ema: Network  # exponential moving average of the actor over updates; the one that is flown
+    episodes: Episode  # a batch, along the last axis
+    key: Any  # raw, of starts and noise
+    observation: Any  # [N, 17] last seen
+    torch_random: Any  # the state of torch's generator: actions
+    numpy_random: Any  # the state of NumPy's: minibatches
+    minibatches: Array  # Adam's steps
+    updates: Array
+
+
+def check_installed() -> None:
+    """Nothing, where Stable-Baselines3 is installed.
+
+    Raises:
+        BadInput: it is not.
+    """
+    for package in ("gymnasium", "torch", "stable_baselines3"):
+        require(package, "sb3")
+
+
+def check_settings(settings: PpoSettings) -> None:
+    """Nothing, where Stable-Baselines3's PPO has all that the settings ask for.
+
+    Raises:
+        BadInput: it lacks one of them.
+    """
+    for name in OURS_ALONE:
+        given, allowed = (np.asarray(getattr(each, name)).tolist() for each in (settings, PpoSettings()))
+        if given != allowed:
+            raise BadInput(
+                f"ppo.{name}: {json.dumps(given)} is not allowed with trainer sb3, whose PPO has no such setting. "
+                f"Allowed: {json.dumps(allowed)}. Set it so, or use trainer ppo."
+            )
+
+
+def policy(settings: PpoSettings, train_state: TrainState) -> Policy:
+    """The policy that is flown: the averaged actor's mean action."""
+    return Policy(actor=train_state.ema, input_scale=jnp.ones(SIZE), squash="clip")
+
+
+def last_policy(settings: PpoSettings, train_state: TrainState) -> Policy:
+    """The policy of the last update, the paper's as printed."""
+    return Policy(actor=actor_network(train_state.weights), input_scale=jnp.ones(SIZE), squash="clip")
+
+
+def start(task: Task, settings: PpoSettings, key: jax.Array) -> TrainState:
+    """A learner before its first update."""
+    with _lent_generators():
+        workbench = _Workbench(task, settings, int(jax.random.bits(key)))
+        taken = workbench.take()
+    return TrainState(
+        workbench=workbench,
+        ema=actor_network(taken["weights"]),
+        updates=jnp.zeros((), jnp.int32),
+        **taken,
+    )
+
+
+def update(task: Task, settings: PpoSettings, train_state: TrainState) -> tuple[TrainState, dict[str, Any]]:
+    """The learner after one update, and what it saw."""
+    with _lent_generators():
+        train_state.workbench.put(train_state)
+        seen = train_state.workbench.update(train_state)
+        taken = train_state.workbench.take()
+    ema = averaged(train_state.ema, actor_network(taken["weights"]), settings.ema_decay, train_state.updates)
+    return TrainState(workbench=train_state.workbench, ema=ema, updates=train_state.updates + 1, **taken), seen
+
+
+def make_model(settings: PpoSettings, environments: Any, seed: int) -> Any:
+    """Stable-Baselines3's PPO with our settings, on a vector environment of its kind."""
+    from stable_baselines3 import PPO
+    from torch.nn import Tanh
+
+    hidden = list(settings.hidden)
+    return PPO(
+        "MlpPolicy",
+        environments,
+        n_steps=settings.rollout,
+        n_epochs=settings.epochs,
+        batch_size=settings.minibatch,
+        learning_rate=float(settings.learning_rate),
+        clip_range=float(settings.clip),
+        gamma=float(settings.discount),
+        gae_lambda=float(settings.gae_lambda),
+        vf_coef=float(settings.value_weight),
+        ent_coef=float(settings.entropy_weight),
+        max_grad_norm=float(settings.max_grad_norm),
+        policy_kwargs={
+            "net_arch": {"pi": hidden, "vf": hidden},
+            "activation_fn": Tanh,
+            "log_std_init": float(settings.initial_log_std),
+        },
+        seed=seed,
+        device="cpu",
+    )
+
+
+class _Workbench:
+    """Stable-Baselines3's model of a training, and the environments it learns in."""
+
+    def __init__(self, task: Task, settings: PpoSettings, seed: int) -> None:
+        from flytune.adapters.vec_env import HoverVecEnv
+
+        self.task, self.settings = task, settings
+        self.environments = HoverVecEnv(task, settings.environments, seed)
+        self.model = make_model(settings, self.environments, seed)
+
+    def put(self, train_state: TrainState) -> None:
+        """Bring model, environments and random numbers to where a learner is."""
+        import torch
+
+        def tensor(values: Any) -> torch.Tensor:
+            return torch.from_numpy(np.array(values))
+
+        network = self.model.policy
+        network.load_state_dict({name: tensor(values) for name, values in train_state.weights.items()})
+        memory = {
+            index: {
+                "step": tensor(np.float32(train_state.minibatches)),
+                "exp_avg": tensor(train_state.first_moments[name]),
+                "exp_avg_sq": tensor(train_state.second_moments[name]),
+            }
+            for index, (name, _) in enumerate(network.named_parameters())
+        }
+        network.optimizer.load_state_dict({**network.optimizer.state_dict(), "state": memory})
+        batch = self.environments.batch
+        # copies, since the step's compiled code uses their memory again
+        batch.episodes = jax.tree.map(jnp.array, train_state.episodes)
+        batch.key = jax.random.wrap_key_data(jnp.array(train_state.key))
+        batch.observation = np.array(train_state.observation)
+        numbers = np.array(train_state.numpy_random)
+        # the global one, since it is what Stable-Baselines3 draws from
+        np.random.set_state(  # noqa: NPY002
+            {"bit_generator": "MT19937", "state": {"key": numbers[:-1], "pos": int(numbers[-1])}}
+        )
+        torch.set_rng_state(tensor(train_state.torch_random))
+
+    def take(self) -> dict[str, Any]:
+        """Model, environments and random numbers as they are, in copies: the fields of a learner."""
+        import torch
+
+        network, batch = self.model.policy, self.environments.batch
+        memory = network.optimizer.state  # empty before the first step, when the moments are zero
+        named = list(network.named_parameters())
+
+        def moments(kind: str) -> dict[str, np.ndarray]:
+            return {
+                name: memory[weight][kind].numpy().copy() if weight in memory else np.zeros(weight.shape, np.float32)
+                for name, weight in named
+            }
+
+        steps = {int(memory[weight]["step"]) for _, weight in named if weight in memory}
+        state = np.random.get_state(legacy=False)["state"]  # noqa: NPY002
+        return {
+            "weights": {name: weight.detach().numpy().copy() for name, weight in named},
+            "first_moments": moments("exp_avg"),
+            "second_moments": moments("exp_avg_sq"),
+            "episodes": jax.tree.map(np.array, batch.episodes),
+            "key": np.array(jax.random.key_data(batch.key)),
+            "observation": batch.observation.copy(),
+            "torch_random": torch.get_rng_state().numpy().copy(),
+            "numpy_random": np.append(state["key"], np.uint32(state["pos"])),
+            "minibatches": jnp.asarray(max(steps, default=0), jnp.int32),
+        }
+
+    def update(self, train_state: TrainState) -> dict[str, Any]:
+        """What was seen in one rollout and its epochs.
+
+        Raises:
+            Diverged: the weights stopped being finite.
+        """
+        from stable_baselines3.common.callbacks import BaseCallback
+
+        environments, transitions = self.environments, []
+
+        class Watch(BaseCallback):
+            def _on_step(self) -> bool:
+                transitions.append(environments.transition)
+                return True
+
+        self.model._last_obs = environments.batch.observation
+        # whether a rollout's first step began an episode: kept for those that look further back, and nobody here does
+        self.model._last_episode_starts = np.ones(self.settings.environments, bool)
+        samples = self.settings.environments * self.settings.rollout
+        try:
+            # one rollout and its epochs, so that the second, the first to be logged, never comes
+            self.model.learn(samples, Watch(), log_interval=2, reset_num_timesteps=False)
+        except (ValueError, RuntimeError) as error:
+            if not any(words in str(error) for words in REFUSALS):
+                raise
+            number = int(train_state.updates) + 1
+            raise Diverged(
+                f"training: the weights stop being finite in update {number} ({number * samples} environment steps). "
+                "A smaller learning_rate, or smaller weights in the reward, may help."
+            ) from None
+        logged = self.model.logger.name_to_value
+        return {**_account(self.task, transitions), **{name: np.asarray(logged[key]) for name, key in LOSSES.items()}}
+
+
+def _account(task: Task, transitions: list[Transition]) -> dict[str, Any]:
+    """The rewards, ends and lengths of a rollout, as `account` gives them for our own trainers."""
+
+    def column(name: str) -> np.ndarray:
+        return np.stack([getattr(transition, name) for transition in transitions])
+
+    ended, cause = column("ended"), column("cause")
+
+    def mean_at_end(values: np.ndarray) -> np.ndarray:
+        return np.asarray(values[ended].mean() if ended.any() else np.nan)
+
+    return {
+        "reward": column("reward").mean(),
+        "terms": {name: np.mean([transition.terms[name] for transition in transitions]) for name in task.reward},
+        "terminations": np.bincount(cause[cause >= 0], minlength=len(causes(task.termination))),
+        "episodes": ended.sum(),
+        "episode_reward": mean_at_end(column("episode_return")),
+        "episode_length": mean_at_end(column("episode_length")),
+    }
+
+
+@contextlib.contextmanager
+def _lent_generators() -> Iterator[None]:
+    """The process's random numbers and torch's threads, lent to a training and given back as they were.
+
+    One thread, so that results repeat bit by bit; at this size more are no faster.
+    """
+    import torch
+
+    before = torch.get_rng_state(), np.random.get_state(), random.getstate(), torch.get_num_threads()  # noqa: NPY002
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_rng_state(before[0])
+        np.random.set_state(before[1])  # noqa: NPY002
+        random.setstate(before[2])
+        torch.set_num_threads(before[3])

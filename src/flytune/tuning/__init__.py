@@ -1,0 +1,1 @@
+"""Tuning: from a wanted step response to a task, by rules and measured sensitivities."""

@@ -1,0 +1,215 @@
+"""The command line as a user meets it: real processes, their output, their exit codes, and what they leave behind."""
+
+import json
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from tests.command import flytune, interrupted
+
+SMALL = [
+    "apg.environments=4",
+    "apg.window=10",
+    "apg.updates=4",
+    "apg.hidden=[8, 8]",
+]
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    return tmp_path_factory.mktemp("user")
+
+
+@pytest.fixture(scope="module")
+def run(folder):
+    answer = flytune("train", "baseline", "--set", *SMALL, cwd=folder)
+    lines = answer.stdout.splitlines()
+    assert lines[-1] == "runs/baseline-apg-s0"
+    assert lines[-2].startswith("settled ")
+    assert "reward" in answer.stderr and "steps" in answer.stderr
+    return lines[-1]
+
+
+def test_help_explains_itself_without_importing_jax(folder):
+    code = (
+        "import sys\n"
+        "from flytune.cli.main import main\n"
+        "try:\n    main(['--help'])\nexcept SystemExit as stop:\n    assert stop.code == 0\n"
+        "assert not {'jax', 'numpy', 'pydantic', 'plotly'} & set(sys.modules), 'imported too early'\n"
+    )
+    answer = subprocess.run([sys.executable, "-c", code], cwd=folder, capture_output=True, text=True, check=False)
+    assert answer.returncode == 0, answer.stderr
+    for command in ("train", "evaluate", "report", "show", "bench"):
+        assert command in answer.stdout
+
+
+@pytest.mark.parametrize("command", ["train", "evaluate", "report", "show", "bench"])
+def test_each_command_explains_its_options(folder, command):
+    assert "usage: flytune " + command in flytune(command, "--help", cwd=folder).stdout.replace(
+        "__main__.py", "flytune"
+    )
+
+
+def test_a_second_training_without_out_gets_a_number_of_its_own(folder, run):
+    assert flytune("train", "baseline", "--set", *SMALL, cwd=folder).stdout.splitlines()[-1] == f"{run}-2"
+
+
+def test_evaluate_prints_exactly_one_json_object_with_the_keys_of_the_contract(folder, run):
+    answer = flytune("evaluate", run, "--trials", 7, "--duration", 2, "--json", cwd=folder)
+    judged = json.loads(answer.stdout)
+    assert judged["schema"] == 1 and judged["trials"] == 7 and judged["duration"] == 2.0
+    assert list(judged) == [
+        "schema", "who", "task", "vehicle", "world", "trials", "seed", "starts", "duration", "axes", "position",
+        "secondary", "infeasible", "crashed", "violations", "peak_speed", "action", "efficiency",
+    ]  # fmt: skip
+    assert set(judged["axes"]) == {"x", "y", "z", "yaw"}
+    assert json.loads((folder / run / "evaluation.json").read_text()) == judged
+
+
+def test_evaluate_prints_a_table_and_writes_named_trajectories(folder, run):
+    answer = flytune("evaluate", run, "--trials", 3, "--duration", 2, "--flights", "flights.npz", cwd=folder)
+    assert re.search(r"^yaw\s+\d/3", answer.stdout, flags=re.MULTILINE)
+    with np.load(folder / "flights.npz") as file:
+        columns = list(file["columns"])
+        assert file["data"].shape == (3, 201, len(columns))
+        assert columns[:4] == ["time", "x", "y", "z"] and "margin_speed" in columns
+        np.testing.assert_allclose(file["data"][:, :, 0], np.tile(np.arange(201) * 0.01, (3, 1)), atol=1e-6)
+
+
+def test_evaluate_flies_a_bare_policy_for_the_task_in_its_header(folder, run):
+    policy = Path(run) / "policy.safetensors"
+    from_file = json.loads(flytune("evaluate", policy, "--trials", 3, "--json", cwd=folder).stdout)
+    from_run = json.loads(flytune("evaluate", run, "--trials", 3, "--json", cwd=folder).stdout)
+    assert {**from_file, "who": ""} == {**from_run, "who": ""}
+
+
+def test_evaluate_writes_where_out_says_and_leaves_the_run_alone(folder, run):
+    before = (folder / run / "evaluation.json").read_bytes()
+    flytune("evaluate", run, "--trials", 2, "--duration", 2, "--out", "elsewhere", cwd=folder)
+    assert json.loads((folder / "elsewhere" / "evaluation.json").read_text())["trials"] == 2
+    assert (folder / run / "evaluation.json").read_bytes() == before
+
+
+def test_report_writes_one_page(folder, run):
+    answer = flytune("report", run, "--trials", 5, "--duration", 2, "--out", "page.html", cwd=folder)
+    assert answer.stdout.splitlines()[-1] == "page.html"
+    assert "plotly" in (folder / "page.html").read_text(encoding="utf-8")
+
+
+def test_show_prints_a_task_that_can_be_trained_again(folder):
+    text = flytune("show", "acrobatic", cwd=folder).stdout
+    assert re.search(r"^weight = 0.08 # .*paper R12", text, flags=re.MULTILINE)
+    (folder / "mine.toml").write_text(text, encoding="utf-8")
+    assert flytune("show", "mine.toml", cwd=folder).stdout == text
+
+
+def test_the_same_seed_gives_the_same_policy_file_from_two_processes(folder, run):
+    flytune("train", "baseline", "--set", *SMALL, "--out", "again", cwd=folder)
+    first = (folder / run / "policy.safetensors").read_bytes()
+    assert (folder / "again" / "policy.safetensors").read_bytes() == first
+
+
+BAD = [
+    (["train", "basline"], "Did you mean baseline?"),
+    (["train", "missing.toml"], "missing.toml"),
+    (["train", "baseline", "--set", "reward.velocity.wieght=0.2"], "Did you mean reward.velocity.weight"),
+    (["train", "baseline", "--set", "reward.velocity.weight=-1"], "0 or more"),
+    (["train", "baseline", "--set", "reward.velocity.weight=nan"], "0 or more"),
+    (["train", "baseline", "--set", "reward.velocity.weight=fast"], "0 or more"),
+    (["train", "baseline", "--set", "termination.speed.bound=0"], "above 0"),
+    (["train", "baseline", "--set", "nonsense"], "path=value"),
+    (["train", "baseline", "--steps", "0"], "1 or more"),
+    (["train", "baseline", "--steps", "many"], "--steps"),
+    (["train", "baseline", "--seed", "-1"], "seed"),
+    (["train", "baseline", "--trainer", "sarsa"], "apg"),
+    (["train", "baseline", "--resume"], "--out"),
+    (["train", "baseline", "--resume", "--out", "nowhere"], "holds no run"),
+    (["train"], "TASK"),
+    (["fly"], "train"),
+    (["evaluate", "nobody"], "no such controller"),
+    (["evaluate", "broken.safetensors"], "is not a policy"),
+    (["report", "nobody"], "no such controller"),
+    (["show", "basline"], "Did you mean baseline?"),
+    (["bench", "sleep"], "simulate"),
+]
+
+
+@pytest.mark.parametrize(("arguments", "word"), BAD, ids=[" ".join(arguments) for arguments, _ in BAD])
+def test_bad_input_is_one_clear_line_exit_code_two_and_nothing_written(tmp_path, arguments, word):
+    (tmp_path / "broken.safetensors").write_bytes(b"\x00\x01garbage")
+    answer = flytune(*arguments, cwd=tmp_path, expect=2)
+    assert answer.stdout == ""
+    assert len(answer.stderr.strip().splitlines()) == 1, answer.stderr
+    assert word in answer.stderr
+    assert [path.name for path in tmp_path.iterdir()] == ["broken.safetensors"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "word"),
+    [
+        (["--trials", "0"], "trials"),
+        (["--duration", "nan"], "duration"),
+        (["--duration", "0.2"], "duration"),
+        (["--seed", "-3"], "seed"),
+        (["--starts", "cloudy"], "clear"),
+        (["--task", "basline"], "baseline"),
+        (["--flights", "no/such/folder/f.npz"], "no/such/folder"),
+        (["--world", "mars"], "flytune"),
+    ],
+)
+def test_bad_trials_are_refused_before_anything_flies(folder, run, arguments, word):
+    before = (folder / run / "evaluation.json").read_bytes()
+    answer = flytune("evaluate", run, *arguments, cwd=folder, expect=2)
+    assert len(answer.stderr.strip().splitlines()) == 1 and word in answer.stderr
+    assert (folder / run / "evaluation.json").read_bytes() == before
+
+
+@pytest.mark.parametrize(
+    ("name", "content"), [("run.json", "{}"), ("run.json", "[]"), ("metrics.jsonl", "3\n"), ("metrics.jsonl", "{")]
+)
+def test_a_damaged_run_is_named_and_refused(folder, run, tmp_path, name, content):
+    shutil.copytree(folder / run, tmp_path / "run")
+    (tmp_path / "run" / name).write_text(content)
+    answer = flytune("evaluate", "run", cwd=tmp_path, expect=2)
+    assert len(answer.stderr.strip().splitlines()) == 1 and f"run/{name}: is damaged" in answer.stderr
+
+
+def test_a_directory_that_holds_a_run_is_refused(folder, run):
+    before = {path: path.read_bytes() for path in (folder / run).rglob("*") if path.is_file()}
+    answer = flytune("train", "baseline", "--set", *SMALL, "--out", run, cwd=folder, expect=2)
+    assert "already holds a run" in answer.stderr
+    assert {path: path.read_bytes() for path in (folder / run).rglob("*") if path.is_file()} == before
+
+
+def test_a_training_that_diverges_ends_with_exit_code_three_and_says_what_and_when(folder):
+    edits = [*SMALL, "apg.learning_rate=1e38"]
+    answer = flytune("train", "baseline", "--set", *edits, "--out", "diverged", cwd=folder, expect=3)
+    assert re.search(r"is -?(nan|inf) in update \d+", answer.stderr)
+
+
+def test_ctrl_c_saves_a_checkpoint_exits_with_130_and_resumes_to_the_same_policy(folder):
+    edits = [edit for edit in SMALL if "updates" not in edit] + ["apg.updates=400"]
+    train = ["train", "baseline", "--set", *edits]
+    whole = flytune(*train, "--out", "whole", cwd=folder)
+    assert whole.stdout.splitlines()[-1] == "whole"
+    message = interrupted(*train, "--out", "cut", cwd=folder, at="10 %")
+    assert "cut/checkpoint" in message
+    assert "flytune train cut/task.toml --trainer apg --seed 0 --out cut --resume" in message
+    assert not (folder / "cut" / "policy.safetensors").exists()
+    assert "has not ended" in flytune("evaluate", "cut", cwd=folder, expect=2).stderr
+    flytune(*["train", "cut/task.toml", "--trainer", "apg", "--seed", "0", "--out", "cut", "--resume"], cwd=folder)
+    assert (folder / "cut" / "policy.safetensors").read_bytes() == (
+        folder / "whole" / "policy.safetensors"
+    ).read_bytes()
+
+
+@pytest.mark.slow
+def test_bench_prints_one_json_object_of_rates(folder):
+    rates = json.loads(flytune("bench", "--json", cwd=folder, timeout=1200).stdout)
+    assert rates["ppo"] > 0 and rates["apg"] > 0 and rates["simulate"] > 0
+    assert 0 < rates["ppo_share_of_limit"] < 1.5
+    assert all(row["steps_per_second"] or row["missing"] for row in rates["training"] + rates["simulation"])

@@ -1,0 +1,78 @@
+"""The comparison with the baseline: what is not installed is named, and ratios are to the first row."""
+
+import pytest
+
+pytest.importorskip("stable_baselines3", reason="needs flytune[sb3]")
+
+import contextlib
+import sys
+import time
+
+from flytune.adapters.vec_env import HoverVecEnv
+from flytune.bench import baselines
+from flytune.task.task import load_task
+
+
+def contender(what, run=lambda: None, extras=()):
+    return baselines.Contender(
+        what=what, environments=4, steps=1024, extras=extras, prepare=lambda: contextlib.nullcontext(run)
+    )
+
+
+@pytest.mark.parametrize(("package", "extras"), [("pybullet", ("pybullet", "sb3")), ("stable_baselines3", ("sb3",))])
+def test_what_is_not_installed_is_named_with_its_command_and_has_no_rate(monkeypatch, package, extras):
+    monkeypatch.setitem(sys.modules, package, None)
+    lacking, there = baselines.measure([contender("A on B", extras=extras), contender("B")])
+    command = f'pip install "flytune[{",".join(extras)}]"'
+    assert (lacking.steps_per_second, lacking.ratio, lacking.missing) == (None, None, command)
+    assert "not installed" in lacking.line() and command in lacking.line() and "4 x 1024" in lacking.line()
+    assert there.steps_per_second > 0 and there.ratio is None and "steps/s" in there.line()
+
+
+def test_rates_are_those_of_the_fastest_repetition_and_ratios_are_to_the_first():
+    waits = {"slow": [0.3, 0.04, 0.2, 0.04, 0.2, 0.04], "fast": [0.3, 0.02, 0.1, 0.02, 0.1, 0.02]}
+
+    def waiting(name):
+        return contender(name, lambda: time.sleep(waits[name].pop()), extras=("sb3",))
+
+    slow, fast = baselines.measure([waiting("slow"), waiting("fast")])
+    assert slow.steps_per_second <= 4096 / 0.04 and fast.steps_per_second <= 4096 / 0.02
+    assert slow.ratio == 1 and fast.ratio == fast.steps_per_second / slow.steps_per_second
+    assert f"{fast.steps_per_second:,.0f} steps/s" in fast.line() and f"{fast.ratio:.1f} x" in fast.line()
+
+
+def test_contenders_take_turns(monkeypatch):
+    order = []
+    baselines.measure([contender(name, lambda name=name: order.append(name)) for name in "ab"])
+    assert order == list("ab" * (1 + baselines.ROUNDS))
+
+
+def test_a_repetition_steps_every_environment_and_an_update_learns_from_them(monkeypatch):
+    monkeypatch.setattr(baseline, "STEPS", 20)
+    counted = []
+
+    class Counting(HoverVecEnv):
+        def step_wait(self):
+            counted.append(self.num_envs)
+            return super().step_wait()
+
+    task = load_task("baseline", {"ppo.environments": 3, "ppo.rollout": 8, "ppo.minibatch": 24, "ppo.epochs": 1})
+
+    def made(number):
+        return contextlib.nullcontext(Counting(task, number))
+
+    with baselines._stepping(made, 3) as run:
+        run()
+    assert counted == [3] * 20
+    with baselines._training(task, made, 3, 8) as run:
+        model = run()
+    assert counted[20:] == [3] * 8 and model.num_timesteps == 24
+
+
+def test_the_simulators_compared_are_there_to_be_timed(monkeypatch):
+    pytest.importorskip("pybullet", reason="needs flytune[pybullet]")
+    monkeypatch.setattr(baseline, "STEPS", 30)
+    task = load_task("baseline")
+    for prepare in (baselines._one(task, "pybullet"), baselines._one(task, "flytune"), baselines._alone(task)):
+        with prepare as run:
+            run()

@@ -1,0 +1,103 @@
+"""Analytic policy gradient: the gradient is the true one, and following it flies."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from flytune.evaluation.fly import fly
+from flytune.evaluation.judge import judge
+from flytune.simulation import environment
+from flytune.task.observation import input_scale
+from flytune.task.task import load_task
+from flytune.training import apg
+
+
+@pytest.fixture(scope="module")
+def train_state(small_task):
+    return apg.start(small_task, small_task.apg, jax.random.key(0))
+
+
+def test_the_gradient_agrees_with_finite_differences_of_the_flown_reward(small_task, train_state):
+    def cost(actor):
+        return apg._loss(small_task, small_task.apg, actor, train_state.episodes, jax.random.key(1))[0]
+
+    value, gradient = jax.jit(jax.value_and_grad(cost))(train_state.actor)
+    jitted = jax.jit(cost)
+    assert np.isfinite(value)
+    # along the gradient itself the directional derivative is its squared norm
+    squared = sum(float(jnp.sum(leaf**2)) for leaf in jax.tree.leaves(gradient))
+    size = 1e-2 / squared**0.5
+    ahead = jax.tree.map(lambda w, g: w + size * g, train_state.actor, gradient)
+    behind = jax.tree.map(lambda w, g: w - size * g, train_state.actor, gradient)
+    measured = (float(jitted(ahead)) - float(jitted(behind))) / (2 * size)
+    assert measured == pytest.approx(squared, rel=0.03)
+
+
+def test_the_barrier_costs_nothing_inside_its_margin_and_grows_as_a_square_beyond(small_task):
+    settings = dataclasses.replace(small_task.apg, barrier_weight=30.0, barrier_margin=0.1)
+    costs = [float(apg.barrier(jnp.asarray(margin), settings)) for margin in (0.5, 0.1, 0.0, -0.1)]
+    # 30 * 0.1^2 = 0.3 at the bound, 30 * 0.2^2 = 1.2 as far beyond
+    np.testing.assert_allclose(costs, [0.0, 0.0, 0.3, 1.2], atol=1e-6)
+
+
+def flying(speed):
+    return jnp.asarray(speed, jnp.float32), jnp.zeros(()), jnp.zeros(())
+
+
+@pytest.mark.parametrize(("termination_slack", "over"), [(0.0, True), (0.3, True), (0.6, False)])
+def test_an_episode_goes_on_until_a_bound_is_passed_by_the_leeway(small_task, termination_slack, over):
+    # 1.5 times as fast as allowed: a margin of -0.5
+    episode = environment.reset(small_task, jax.random.key(0))
+    fast = dataclasses.replace(episode.state, velocity=flying(1.5 * small_task.speed_bound))
+    moved, outcome = environment.step(small_task, dataclasses.replace(episode, state=fast), jnp.zeros(4))
+    assert bool(outcome.terminated)
+    settings = dataclasses.replace(small_task.apg, termination_slack=termination_slack)
+    assert bool(apg.forgiven(small_task, moved, outcome, settings).terminated) is over
+
+
+def test_an_episode_within_the_leeway_still_ends_at_its_horizon(small_task):
+    episode = environment.reset(small_task, jax.random.key(0))
+    fast = dataclasses.replace(episode.state, velocity=flying(1.2 * small_task.speed_bound))
+    last = dataclasses.replace(episode, state=fast, steps=jnp.asarray(small_task.horizon - 1))
+    moved, outcome = environment.step(small_task, last, jnp.zeros(4))
+    assert not bool(outcome.truncated)
+    outcome = apg.forgiven(small_task, moved, outcome, dataclasses.replace(small_task.apg, termination_slack=0.5))
+    assert bool(outcome.truncated)
+    assert not bool(outcome.terminated)
+
+
+def test_each_block_of_the_observation_has_its_own_scale(small_task):
+    scale = input_scale((1.0, 2.0, 3.0, 4.0, 5.0))
+    np.testing.assert_array_equal(scale, [1] * 3 + [2] * 4 + [3] * 3 + [4] * 3 + [5] * 4)
+
+
+def test_episodes_go_on_from_update_to_update(small_task):
+    train_state = apg.start(small_task, small_task.apg, jax.random.key(0))
+    train_state, _ = apg.update(small_task, small_task.apg, train_state)
+    train_state, _ = apg.update(small_task, small_task.apg, train_state)
+    assert int(jnp.max(train_state.episodes.steps)) == 2 * small_task.apg.window
+
+
+def test_the_average_is_the_mean_of_the_first_weights(small_task):
+    train_state = apg.start(small_task, small_task.apg, jax.random.key(0))
+    seen = []
+    for _ in range(3):
+        train_state, _ = apg.update(small_task, small_task.apg, train_state)
+        seen.append(np.asarray(train_state.actor.weights[0]))
+    np.testing.assert_allclose(train_state.ema.weights[0], np.mean(seen, axis=0), atol=1e-6)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("vehicle", "updates", "wanted"), [("crazyflie", 300, 99), ("crazyflie-measured", 600, 95)])
+def test_apg_settles_the_trials_on_every_axis_without_a_crash(vehicle, updates, wanted):
+    task = load_task("baseline", {"vehicle": vehicle, "apg.updates": updates})
+    train_state = apg.start(task, task.apg, jax.random.key(0))
+    for _ in range(task.apg.updates):
+        train_state, _ = apg.update(task, task.apg, train_state)
+    judgement = judge(fly(apg.policy(task.apg, train_state), task))
+    settled = {axis: judgement.settled(axis) for axis in ("x", "y", "z", "yaw")}
+    assert min(settled.values()) >= wanted, settled
+    assert not judgement.crashed.any()

@@ -1,0 +1,147 @@
+"""Requirements: what is refused, what is measured, and what is missing."""
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+
+from flytune.errors import BadInput
+from flytune.evaluation.fly import fly
+from flytune.evaluation.judge import judge
+from flytune.task.task import load_task
+from flytune.tuning.requirement import Measured, make_requirement
+
+GOOD = Measured(settling_time=2.5, overshoot=0.0, error=0.001, settled=1.0, kept=1.0)
+
+
+def but(**changes):
+    return dataclasses.replace(GOOD, **changes)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        ({"settling_time": 2500}, r"settling-time: 2500 .*0\.2 to 60 s.*Did you mean 2\.5 "),
+        ({"settling_time": -1}, r"settling-time: -1 is not allowed\. Allowed: 0\.2 to 60 s"),
+        ({"settling_time": math.nan}, r"settling-time: nan is not allowed"),
+        ({"settling_time": math.inf}, r"settling-time: inf is not allowed"),
+        ({"settling_time": 2, "overshoot": 0.05}, r"overshoot: 0\.05 .*Did you mean 5 \(percent"),
+        ({"settling_time": 2, "overshoot": -3}, r"overshoot: -3 is not allowed\. Allowed: 0 to 100 %"),
+        ({"settling_time": 2, "overshoot": math.nan}, r"overshoot: nan is not allowed"),
+        ({"settling_time": 2, "error": 5}, r"error: 5 .*Did you mean 0\.005 \(metres"),
+        ({"settling_time": 2, "error": 0}, r"error: 0 is not allowed"),
+        ({"settling_time": 2, "error": 0.03}, r"error: 0\.03 .*does not count as settled"),
+        ({"settling_time": 2, "tolerance": 0.1}, r"tolerance: 0\.1 .*Did you mean 10\?"),
+        ({"settling_time": 2, "percentile": 0.5}, r"percentile: 0\.5 .*Did you mean 50\?"),
+        ({"settling_time": 2, "percentile": 100}, r"percentile: 100 is not allowed"),
+        ({"settling_time": 2, "axis": "w"}, r"axis: 'w' is not allowed\. Allowed: position, x, y, z, yaw"),
+    ],
+)
+def test_numbers_that_cannot_be_meant_are_refused_with_what_is_allowed(arguments, said):
+    with pytest.raises(BadInput, match=said):
+        make_requirement(**arguments)
+
+
+def test_units_of_the_command_line_become_those_of_the_judge():
+    wanted = make_requirement(3, overshoot=4, error=2, axis="yaw", tolerance=20)
+    assert wanted.overshoot == pytest.approx(0.04)
+    assert wanted.error == pytest.approx(math.radians(2))
+    assert wanted.tolerance == pytest.approx(0.2)
+
+
+@pytest.mark.parametrize(
+    ("measured", "missing"),
+    [
+        (GOOD, {}),
+        (but(settling_time=2.76), {"settling_time"}),
+        (but(settling_time=2.74), set()),
+        (but(settling_time=2.24), {"settling_time"}),
+        (but(settling_time=math.inf, settled=0.4), {"settling_time", "settled"}),
+        (but(overshoot=0.051), {"overshoot"}),
+        (but(error=0.0101), {"error"}),
+        (but(settled=0.985), {"settled"}),
+        (but(kept=0.98), {"kept"}),
+    ],
+)
+def test_what_is_missing_of_a_target(measured, missing):
+    assert set(make_requirement(2.5).misses(measured)) == set(missing)
+
+
+def test_an_upper_bound_has_no_lower_side_and_no_tolerance():
+    wanted = make_requirement(2.5, at_most=True)
+    assert not wanted.misses(but(settling_time=0.5))
+    assert not wanted.misses(but(settling_time=2.5))
+    assert set(wanted.misses(but(settling_time=2.51))) == {"settling_time"}
+
+
+def test_the_tuning_starts_are_asked_for_more_of_everything_but_the_shares():
+    wanted = make_requirement(2.5)
+    barely = but(settling_time=2.7, overshoot=0.045, error=0.009, settled=0.99)
+    assert not wanted.misses(barely)
+    assert set(wanted.narrowed().misses(barely)) == {"settling_time", "overshoot", "error"}
+    early = make_requirement(2.5, at_most=True).narrowed()
+    assert early.latest() == pytest.approx(2.375)
+    assert early.aim() < early.latest()
+
+
+def test_a_miss_is_finite_and_of_the_right_sign_whatever_was_measured():
+    for at_most in (False, True):
+        wanted = make_requirement(3.4, at_most=at_most).narrowed()
+        for time in (0.0, 1.0, wanted.aim(), wanted.latest() + 1e-9, 50.0, math.inf):
+            miss = wanted.misses(but(settling_time=time, error=math.inf, overshoot=math.inf)).get("settling_time")
+            assert miss is None or (math.isfinite(miss) and miss * (time - wanted.aim()) > 0)
+    assert set(make_requirement(2).misses(but(settling_time=0.0))) == {"settling_time"}
+
+
+def test_too_slow_is_positive_and_too_fast_negative():
+    wanted = make_requirement(2.0)
+    assert wanted.misses(but(settling_time=4.0))["settling_time"] == pytest.approx(math.log(2))
+    assert wanted.misses(but(settling_time=1.0))["settling_time"] == pytest.approx(-math.log(2))
+
+
+def test_the_nearest_response_is_the_one_that_settles_before_the_one_in_time():
+    wanted = make_requirement(2.0)
+    late, lame = but(settling_time=3.0), but(settling_time=2.0, settled=0.9)
+    assert 0 < wanted.distance(late) < wanted.distance(lame)
+    assert wanted.distance(but(settling_time=2.0)) == 0
+
+
+def test_a_flight_is_measured_as_the_judge_measures_it(pid_flights):
+    judged = judge(pid_flights)
+    told = judged.to_dict()
+    position = make_requirement(3).measure(judged)
+    assert position.settling_time == told["position"]["settling_time"]["median"]
+    assert position.error == told["position"]["steady_state_error"]["median"]
+    assert position.settled == told["position"]["settled"] / 40
+    late = make_requirement(3, percentile=95, axis="yaw").measure(judged)
+    assert late.settling_time == told["axes"]["yaw"]["settling_time"]["p95"]
+
+
+def test_only_bounds_the_user_has_set_have_to_be_kept(pid_flights):
+    judged = judge(pid_flights)
+    broken = np.zeros(40, bool)
+    broken[:10] = True
+    judged = dataclasses.replace(judged, violated={**judged.violated, "speed": broken})
+    wanted = make_requirement(3)
+    assert wanted.measure(judged).kept == 1
+    assert wanted.measure(judged, fixed=("speed",)).kept == pytest.approx(0.75)
+
+
+def test_trials_of_two_judgements_count_as_one_set(pid_flights):
+    first = judge(pid_flights)
+    late = {**first.settling_time, "position": first.settling_time["position"] + 100.0}
+    second = dataclasses.replace(first, settling_time=late)
+    both = make_requirement(3, percentile=60).measure(first, second)
+    # 60 % of 80 trials are the 40 early ones and the first 8 of the late ones: the 8th of 40 is percentile 20 of them
+    assert both.settling_time == make_requirement(3, percentile=20).measure(second).settling_time
+    lost = dataclasses.replace(first, settling_time={**late, "position": np.full(40, np.inf)})
+    assert make_requirement(3).measure(first, lost).settled == pytest.approx(0.5)
+
+
+@pytest.fixture(scope="module")
+def pid_flights():
+    from flytune.control.classical import classical_controller
+
+    task = load_task("baseline")
+    return fly(classical_controller("pid", task, "tuned"), task, trials=40, seed=5)
