@@ -10,14 +10,14 @@ from flytune.report.tuning import write_tuning
 
 
 def line(number, time, **changes):
-    measured = {"settling_time": time, "overshoot": 0.01, "error": 0.002, "settled": 1.0, "kept": 1.0}
+    measured = {"settling_time": time, "overshoot": 0.01, "error": 0.002, "settled": 1.0, "constraints_satisfied": 1.0}
     return {
         "number": number,
-        "origin": number - 1 if number else None,
+        "parent": number - 1 if number else None,
         "edit": f"edit {number}",
-        "response": f"response {number}",
+        "result": f"response {number}",
         "seconds": 12.0,
-        "measured": measured,
+        "response": measured,
         **changes,
     }
 
@@ -36,10 +36,10 @@ TUNING = {
     "met": True,
     "best": 2,
     "why": "",
-    "lines": [line(0, 3.0), line(1, None), line(2, 6.1)],
-    "verdicts": [
+    "iterations": [line(0, 3.0), line(1, None), line(2, 6.1)],
+    "validations": [
         {
-            "step": 2,
+            "iteration": 2,
             "seed": 4000,
             "judgement": {
                 "trials": 200,
@@ -72,8 +72,8 @@ def test_every_step_its_reason_and_the_verdict_are_on_the_page(tmp_path):
 def test_no_overshoot_at_all_still_has_an_axis(tmp_path):
     tuning = copy.deepcopy(TUNING)
     tuning["requirement"]["overshoot"] = 0.0
-    for each in tuning["lines"]:
-        each["measured"]["overshoot"] = 0.0
+    for each in tuning["iterations"]:
+        each["response"]["overshoot"] = 0.0
     write_tuning(tmp_path / "page.html", tuning)
     layout = Reader((tmp_path / "page.html").read_text()).figures[0]["layout"]
     assert layout["yaxis2"]["range"][1] > 0
@@ -86,7 +86,7 @@ def test_what_was_not_met_is_said_with_its_reason(tmp_path):
 
 def test_a_hostile_name_stays_text(tmp_path):
     tuning = copy.deepcopy(TUNING)
-    tuning["lines"][0]["edit"] = tuning["title"] = tuning["start"] = HOSTILE
+    tuning["iterations"][0]["edit"] = tuning["title"] = tuning["start"] = HOSTILE
     write_tuning(tmp_path / "page.html", tuning)
     read = Reader((tmp_path / "page.html").read_text())
     assert HOSTILE in read.text

@@ -48,7 +48,7 @@ def _body(tuning: Mapping[str, Any]) -> str:
 
 def response_per_step(tuning: Mapping[str, Any]) -> go.Figure:
     """Settling time, overshoot and error over the steps, each with the band that is asked for."""
-    asked, lines = tuning["requirement"], tuning["lines"]
+    asked, lines = tuning["requirement"], tuning["iterations"]
     numbers = [line["number"] for line in lines]
     degrees = asked["axis"] == "yaw"
     scale, unit = (math.degrees(1), "deg") if degrees else (1e3, "mm")
@@ -62,11 +62,11 @@ def response_per_step(tuning: Mapping[str, Any]) -> go.Figure:
     )  # fmt: skip
     figure = make_subplots(1, 3, subplot_titles=[style.heading(title) for title, *_ in panels], horizontal_spacing=0.08)
     for column, (_, name, factor, (low, high)) in enumerate(panels, start=1):
-        values = [None if line["measured"][name] is None else factor * line["measured"][name] for line in lines]
+        values = [None if line["response"][name] is None else factor * line["response"][name] for line in lines]
         kept = [style.TRIALS[0] if number == tuning["best"] else "white" for number in numbers]
         marker = {"size": 9, "color": kept, "line": {"color": style.TRIALS[0], "width": 1.6}}
         at = dict(zip(numbers, values, strict=True))
-        ways = [(line["origin"], line["number"]) for line in lines if line["origin"] is not None]
+        ways = [(line["parent"], line["number"]) for line in lines if line["parent"] is not None]
         figure.add_trace(
             go.Scatter(x=[end for way in ways for end in (*way, None)],
                        y=[end for first, second in ways for end in (at[first], at[second], None)],
@@ -89,9 +89,9 @@ def response_per_step(tuning: Mapping[str, Any]) -> go.Figure:
 
 def _steps(tuning: Mapping[str, Any]) -> str:
     rows = "".join(
-        f"<tr><th>{line['number']}</th><td>{'' if line['origin'] is None else line['origin']}</td>"
-        f"<td>{escape(line['edit'])}</td><td>{escape(line['response'])}</td><td>{line['seconds']:.0f} s</td></tr>"
-        for line in tuning["lines"]
+        f"<tr><th>{line['number']}</th><td>{'' if line['parent'] is None else line['parent']}</td>"
+        f"<td>{escape(line['edit'])}</td><td>{escape(line['result'])}</td><td>{line['seconds']:.0f} s</td></tr>"
+        for line in tuning["iterations"]
     )
     head = "<tr><th>step</th><th>from</th><th>edit and reason</th><th>what it did</th><th>training</th></tr>"
     return f'<div class="wide"><table class="words"><thead>{head}</thead><tbody>{rows}</tbody></table></div>'
@@ -99,13 +99,13 @@ def _steps(tuning: Mapping[str, Any]) -> str:
 
 def _verdicts(tuning: Mapping[str, Any]) -> str:
     rows = []
-    for verdict in tuning["verdicts"]:
+    for verdict in tuning["validations"]:
         judged = verdict["judgement"]
         axis = tuning["requirement"]["axis"]
         channel = judged["position"] if axis == "position" else judged["axes"][axis]
         median = channel["settling_time"]["median"]
         rows.append(
-            f"<tr><th>{verdict['step']}</th><td>{verdict['seed']}</td>"
+            f"<tr><th>{verdict['iteration']}</th><td>{verdict['seed']}</td>"
             f"<td>{'-' if median is None else f'{median:.2f} s'}</td>"
             f"<td>{channel['settled']}/{judged['trials']}</td><td>{_percent(channel['overshoot']['median'])}</td>"
             f"<td>{_error(channel['steady_state_error']['median'], axis)}</td>"

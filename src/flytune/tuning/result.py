@@ -45,18 +45,29 @@ class Tuning:
         return f"not met: {said} (step {self.best}). {blocked}. Best kept in {self.directory}."
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain values, for a page: `lines` is what was said of each step."""
-        lines, target = [], self.requirement.narrowed()
+        """Plain values for a page.
+
+        Keys: `title` (the requirement as a sentence), `requirement` (its numbers), `start` (name of the first task),
+        `met`, `best` (number of the best iteration), `why` (why it is not met, else empty), `directory`, `iterations`
+        and `validations`. Each iteration has `number`, `parent` (number of the edited iteration, or None), `edit` and
+        `result` (one sentence each), `change` (the edit's own values, or None), `seconds` of training, and `response`
+        (settling_time, overshoot, error, settled, constraints_satisfied; None where infinite). Each validation has
+        `iteration`, `seed`, `judgement` (as `evaluate --json`) and `misses`.
+        """
+        iterations, target = [], self.requirement.narrowed()
         for step in self.steps:
             before = self.steps[step.origin].measured if step.origin is not None else None
-            lines.append(
+            response = step.measured.to_dict()
+            response["constraints_satisfied"] = response.pop("kept")
+            iterations.append(
                 {
                     "number": step.number,
-                    "origin": step.origin,
+                    "parent": step.origin,
                     "edit": describe_edit(step.edit, target) if step.edit else f"start: {self.start}",
-                    "response": describe_step(step, before, target, bounds=bool(self.bounds)),
+                    "result": describe_step(step, before, target, bounds=bool(self.bounds)),
+                    "change": dataclasses.asdict(step.edit) if step.edit else None,
                     "seconds": step.seconds,
-                    "measured": step.measured.to_dict(),
+                    "response": response,
                 }
             )
         return {
@@ -66,6 +77,10 @@ class Tuning:
             "met": self.met,
             "best": self.best,
             "why": "" if self.met else self.why(),
-            "lines": lines,
-            "verdicts": [dataclasses.asdict(verdict) for verdict in self.verdicts],
+            "directory": str(self.directory),
+            "iterations": iterations,
+            "validations": [
+                {"iteration": each.step, "seed": each.seed, "judgement": each.judgement, "misses": each.misses}
+                for each in self.verdicts
+            ],
         }
