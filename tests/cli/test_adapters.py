@@ -7,7 +7,7 @@ import sys
 
 import pytest
 from tests.command import flytune
-from tests.test_cli import SMALL
+from tests.cli.test_cli import SMALL
 
 SHORT = ["--trials", 4, "--duration", 2]
 

@@ -6,7 +6,6 @@ pytest.importorskip("stable_baselines3", reason="needs flytune[sb3]")
 
 import contextlib
 import sys
-import time
 
 from flytune.adapters.vec_env import HoverVecEnv
 from flytune.bench import baselines
@@ -30,25 +29,31 @@ def test_what_is_not_installed_is_named_with_its_command_and_has_no_rate(monkeyp
 
 
 def test_rates_are_those_of_the_fastest_repetition_and_ratios_are_to_the_first():
-    waits = {"slow": [0.3, 0.04, 0.2, 0.04, 0.2, 0.04], "fast": [0.3, 0.02, 0.1, 0.02, 0.1, 0.02]}
+    now = 0.0
+    durations = {"slow": iter([9.0, 4.0, 2.0, 5.0, 2.0, 3.0]), "fast": iter([0.1, 1.0, 0.5, 2.0, 3.0, 1.0])}
 
-    def waiting(name):
-        return contender(name, lambda: time.sleep(waits[name].pop()), extras=("sb3",))
+    def taking(name):
+        def run():
+            nonlocal now
+            now += next(durations[name])
 
-    slow, fast = baselines.measure([waiting("slow"), waiting("fast")])
-    assert slow.steps_per_second <= 4096 / 0.04 and fast.steps_per_second <= 4096 / 0.02
-    assert slow.ratio == 1 and fast.ratio == fast.steps_per_second / slow.steps_per_second
-    assert f"{fast.steps_per_second:,.0f} steps/s" in fast.line() and f"{fast.ratio:.1f} x" in fast.line()
+        return contender(name, run, extras=("sb3",))
+
+    slow, fast = baselines.measure([taking("slow"), taking("fast")], clock=lambda: now)
+    # 4 x 1024 steps in 2 s and in 0.5 s; the first repetition compiles and does not count, however short it is
+    assert (slow.steps_per_second, fast.steps_per_second) == (2048, 8192)
+    assert (slow.ratio, fast.ratio) == (1, 4)
+    assert "8,192 steps/s" in fast.line() and "4.0 x" in fast.line()
 
 
-def test_contenders_take_turns(monkeypatch):
+def test_measurements_take_turns():
     order = []
     baselines.measure([contender(name, lambda name=name: order.append(name)) for name in "ab"])
     assert order == list("ab" * (1 + baselines.ROUNDS))
 
 
 def test_a_repetition_steps_every_environment_and_an_update_learns_from_them(monkeypatch):
-    monkeypatch.setattr(baseline, "STEPS", 20)
+    monkeypatch.setattr(baselines, "STEPS", 20)
     counted = []
 
     class Counting(HoverVecEnv):
@@ -71,7 +76,7 @@ def test_a_repetition_steps_every_environment_and_an_update_learns_from_them(mon
 
 def test_the_simulators_compared_are_there_to_be_timed(monkeypatch):
     pytest.importorskip("pybullet", reason="needs flytune[pybullet]")
-    monkeypatch.setattr(baseline, "STEPS", 30)
+    monkeypatch.setattr(baselines, "STEPS", 30)
     task = load_task("baseline")
     for prepare in (baselines._one(task, "pybullet"), baselines._one(task, "flytune"), baselines._alone(task)):
         with prepare as run:

@@ -108,15 +108,20 @@ def compare_simulation(task: Task, own: Repeat, own_shape: tuple[int, int]) -> l
     )
 
 
-def measure(contenders: list[Contender]) -> list[Row]:
-    """A row for each contender: the fastest of its repetitions, and its ratio to the first."""
+def measure(contenders: list[Contender], clock: Callable[[], float] = time.perf_counter) -> list[Row]:
+    """A row for each contender: the fastest of its repetitions, and its ratio to the first.
+
+    Args:
+        contenders: what to measure, in the order of the rows.
+        clock: gives the time now in seconds.
+    """
     missing = [_missing(contender.extras) for contender in contenders]
     with contextlib.ExitStack() as stack:
         runs = [
             None if lacks else stack.enter_context(contender.prepare())
             for contender, lacks in zip(contenders, missing, strict=True)
         ]
-        fastest = _fastest([run for run in runs if run is not None])
+        fastest = _fastest([run for run in runs if run is not None], clock)
     seconds = [fastest.pop(0) if run is not None else None for run in runs]
     rates = [
         None if time_ is None else contender.environments * contender.steps / time_
@@ -147,18 +152,18 @@ def _missing(extras: tuple[str, ...]) -> str | None:
     return None
 
 
-def _fastest(runs: list[Repeat]) -> list[float]:
+def _fastest(runs: list[Repeat], clock: Callable[[], float]) -> list[float]:
     """Seconds of the fastest repetition of each, after one that is not counted."""
     for run in runs:
         run()
-    best, began = [float("inf")] * len(runs), time.perf_counter()
+    best, began = [float("inf")] * len(runs), clock()
     for number in range(ROUNDS):
-        if number and time.perf_counter() - began > LONGEST:
+        if number and clock() - began > LONGEST:
             break
         for index, run in enumerate(runs):
-            started = time.perf_counter()
+            started = clock()
             run()
-            best[index] = min(best[index], time.perf_counter() - started)
+            best[index] = min(best[index], clock() - started)
     return best
 
 
