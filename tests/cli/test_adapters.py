@@ -6,8 +6,8 @@ import subprocess
 import sys
 
 import pytest
-from tests.command import flytune
 from tests.cli.test_cli import SMALL
+from tests.command import flytune
 
 SHORT = ["--trials", 4, "--duration", 2]
 
