@@ -1,13 +1,14 @@
 # make demo    train the baseline controller, fly 100 trials, write report.html
 # make test    the test suite        make test-slow   the trainings it leaves out
 # make test-sb3  the tests that need PyTorch (a large download)
+# make docs    the documentation as a site, build/docs
 # make check   lint, types, layers   make pins        renew the pinned requirements
 PYTHON ?= python3
 BIN := .venv/bin
 WORKERS ?= 2
 export PIP_DISABLE_PIP_VERSION_CHECK = 1
 
-.PHONY: demo test test-slow test-sb3 check pins clean
+.PHONY: demo test test-slow test-sb3 check docs pins clean
 
 demo: .venv/base.stamp
 	@run=$$($(BIN)/flytune train baseline | tail -n 1) && \
@@ -31,6 +32,10 @@ check: .venv/dev.stamp
 	$(BIN)/pyright
 	$(BIN)/lint-imports
 
+docs: .venv/dev.stamp
+	$(BIN)/python -m sphinx -W --keep-going -q docs build/docs
+	@echo "open build/docs/index.html in a browser"
+
 .venv/base.stamp: requirements/base.txt pyproject.toml
 	test -x $(BIN)/python || $(PYTHON) -m venv .venv
 	$(BIN)/python -m pip install --quiet --require-hashes -r requirements/base.txt
@@ -48,7 +53,7 @@ check: .venv/dev.stamp
 
 PIN := $(BIN)/pip-compile --quiet --generate-hashes --allow-unsafe --strip-extras --no-header --no-annotate \
        --no-emit-index-url --no-emit-trusted-host --no-emit-find-links --no-emit-options
-EXTRAS := $(foreach extra,build dev gymnasium mujoco onnx optuna pybullet tensorboard,--extra $(extra))
+EXTRAS := $(foreach extra,build dev docs gymnasium mujoco onnx optuna pybullet tensorboard,--extra $(extra))
 pins:
 	$(PIN) --extra build -o requirements/base.txt pyproject.toml
 	$(PIN) $(EXTRAS) -c requirements/base.txt -o requirements/dev.txt pyproject.toml

@@ -1,7 +1,7 @@
 """What each parameter of a task really does to the response: the effect map that the tuner reads.
 
     python benchmarks/effect_map.py --out effect-map    # trains what is missing there, then writes the package's data
-    python benchmarks/effect_map.py --docs              # draws docs/heuristics/ from it
+    python benchmarks/effect_map.py --docs              # draws docs/results/heuristics/ from it
 
 One parameter of baseline-refined at a time, five values, three seeds of episodes and noise; trained as the tuner trains, on
 from the policy that ships. (From new weights, 300 updates leave the unchanged baseline at 5.4 s, on its way to 3.0 s:
@@ -35,7 +35,7 @@ PARAMETERS = {
 }
 HERE = Path(__file__).parents[1]
 DATA = HERE / "src" / "flytune" / "tune" / "effects.json"
-DOCS = HERE / "docs" / "heuristics"
+DOCS = HERE / "docs" / "results" / "heuristics"
 
 
 def jobs(seeds: int) -> list[tuple[str | None, float | None, int]]:
@@ -158,7 +158,9 @@ def document_it() -> None:
     effects = load_effects()
     DOCS.mkdir(exist_ok=True)
     draw_effects(DOCS / "effects.svg", effects)
-    (DOCS / "tables.md").write_text(heuristics_tables(effects), encoding="utf-8")
+    (DOCS / "tables.md").write_text(
+        "# The paper's heuristics: every number\n\n" + heuristics_tables(effects), encoding="utf-8"
+    )
     print(DOCS)
 
 

@@ -1,4 +1,4 @@
-"""How exact and how dear the physics step is: the tables of docs/integrator.md, as markdown on standard output.
+"""How exact and how dear the physics step is: the tables of docs/concepts/integrator.md, as markdown on standard output.
 
     python benchmarks/integrator.py
 

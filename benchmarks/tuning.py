@@ -1,7 +1,7 @@
 """Is the heuristic any good? The tuner, Optuna's TPE and random search on the same requirements, with the same budget.
 
     python benchmarks/tuning.py --out tuning-benchmark           # about two hours on two cores; what is done is kept
-    python benchmarks/tuning.py --out tuning-benchmark --docs    # docs/tuning/benchmark.md from what is there
+    python benchmarks/tuning.py --out tuning-benchmark --docs    # docs/results/tuning/benchmark.md from what is there
 
 Every method begins with the same known policy, trains with the same settings, may train twelve times, looks at the
 same tuning starts, and is judged on the same fresh ones. TPE and random search draw the fields the rules may edit from
@@ -200,6 +200,8 @@ def summary(folder: Path) -> str:
         for title, chosen in groups
     ]
     lines = [
+        "# The tuner beside two searches: every requirement",
+        "",
         "| | met | trainings until met, median [95 % interval] | seconds until met, median [95 % interval] |",
         "|---|---|---|---|",
     ]
@@ -238,10 +240,10 @@ if __name__ == "__main__":
     parser.add_argument("--seeds", type=int, default=3, help="of the tuner; the others have one")
     parser.add_argument("--requirements", type=int, nargs="+", default=range(len(GRID)), help="their places in GRID")
     parser.add_argument("--workers", type=int, default=os.cpu_count() or 1)
-    parser.add_argument("--docs", action="store_true", help="write docs/tuning/benchmark.md; tunes nothing")
+    parser.add_argument("--docs", action="store_true", help="write docs/results/tuning/benchmark.md; tunes nothing")
     options = parser.parse_args()
     if options.docs:
-        target = Path(__file__).parents[1] / "docs" / "tuning"
+        target = Path(__file__).parents[1] / "docs" / "results" / "tuning"
         target.mkdir(exist_ok=True)
         (target / "benchmark.md").write_text(summary(options.out), encoding="utf-8")
     else:

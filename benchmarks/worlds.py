@@ -1,4 +1,4 @@
-"""How other simulators differ from flytune's, and why: the tables of docs/worlds.md, as markdown on standard output.
+"""How other simulators differ from flytune's, and why: the tables of docs/results/worlds.md, as markdown on standard output.
 
     python benchmarks/worlds.py [POLICY.safetensors]
 

@@ -43,7 +43,7 @@ def test_a_pilot_flies_the_same_starts_in_another_world(folder, simulator):
     )
     assert there["world"] == simulator
     error_here, error_there = (each["axes"]["x"]["rms_error"]["median"] for each in (here, there))
-    assert error_there == pytest.approx(error_here, rel=0.02)  # docs/worlds.md: centimetres in a metre
+    assert error_there == pytest.approx(error_here, rel=0.02)  # docs/results/worlds.md: centimetres in a metre
 
 
 @pytest.mark.slow

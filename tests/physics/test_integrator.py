@@ -1,6 +1,6 @@
 """The physics step against DOP853 in float64, on the equations of motion written out once more (paper R1 to R6).
 
-docs/integrator.md holds the full table; what is tested here is that its conclusion still stands.
+docs/concepts/integrator.md holds the full table; what is tested here is that its conclusion still stands.
 """
 
 import math

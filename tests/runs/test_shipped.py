@@ -11,7 +11,7 @@ from flytune.runs.shipped import shipped_files, shipped_names
 from flytune.task.task import load_task, preset_names
 
 REFINED = [name for name in preset_names() if name.endswith("-refined")]
-# least of 100 trials on any axis; docs/refined.md says why inspection does not reach more with PPO
+# least of 100 trials on any axis; docs/results/refined.md says why inspection does not reach more with PPO
 SETTLED = {"inspection-refined@ppo": 80}
 
 

@@ -1,7 +1,7 @@
 """Small vectors as tuples of scalars, so that batched physics runs as a few wide loops.
 
 XLA turns arithmetic on scalars (one lane per vehicle under `vmap`) into vectorised loops, but a gradient through
-slices and stacks of length-3 arrays into chains of pads and copies, up to twice as slow (docs/integrator.md).
+slices and stacks of length-3 arrays into chains of pads and copies, up to twice as slow (docs/concepts/integrator.md).
 `unpack` and `pack` are the two doors between arrays and scalars, each the other's transpose.
 """
 

@@ -12,7 +12,7 @@ from flytune.physics.vehicle import Vehicle
 
 CONTROL_PERIOD = 0.01  # s (paper R6)
 PHYSICS_STEPS = (
-    1  # per control period, forces and attitude also at its middle; docs/integrator.md shows that finer buys nothing
+    1  # per control period, forces and attitude also at its middle; docs/concepts/integrator.md shows that finer buys nothing
 )
 
 

@@ -1,4 +1,4 @@
-"""Run directories: what a training leaves behind, and what it needs to go on (docs/definitions.md)."""
+"""Run directories: what a training leaves behind, and what it needs to go on (docs/concepts/definitions.md)."""
 
 import json
 import os

@@ -37,7 +37,7 @@ class PyBulletSimulator:
 
     Bullet keeps the angular velocity in the inertial frame; it is turned into the body frame here. Its multibody
     solver, which URDF files are loaded into, has the gyroscopic torque, advances velocities first and positions with
-    them (semi-implicit Euler, first order), and forgets forces after each step. docs/worlds.md measures all of these.
+    them (semi-implicit Euler, first order), and forgets forces after each step. docs/results/worlds.md measures all of these.
     """
 
     def __init__(self, vehicle: Vehicle, number: int, options: PyBulletOptions) -> None:
