@@ -11,9 +11,7 @@ from flytune.physics.components import Components, add, cross, scale, unpack
 from flytune.physics.vehicle import Vehicle
 
 CONTROL_PERIOD = 0.01  # s (paper R6)
-PHYSICS_STEPS = (
-    1  # per control period, forces and attitude also at its middle; docs/concepts/integrator.md shows that finer buys nothing
-)
+PHYSICS_STEPS = 1  # per control period, forces and attitude also at its middle; docs/concepts/integrator.md shows that finer buys nothing
 
 
 @pytree
