@@ -8,6 +8,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NoReturn
 
+from flytune.config.files import check_file, make_folder, write_json
 from flytune.errors import BadInput, FlytuneError, Unmet
 
 SINGLE_THREADED = "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1"
@@ -307,7 +308,7 @@ def _evaluate(options: argparse.Namespace) -> None:
 def _report(options: argparse.Namespace) -> None:
     from flytune.report.report import write_report
 
-    _check_file("out", options.out)
+    check_file(options.out)
     entries = _entries(options)
     print("\n\n".join(entry.judgement.table() for entry in entries), end="\n\n")
     write_report(options.out, entries)
@@ -430,7 +431,7 @@ def _export(options: argparse.Namespace) -> None:
     from flytune.export.onnx import save_onnx
     from flytune.runs.find import find_controller
 
-    _check_file("out", options.out)
+    check_file(options.out)
     policy = find_controller(options.name).controller
     if not isinstance(policy, Policy):
         raise BadInput(f"{options.name}: is no policy of flytune's own. Allowed: a run directory, .safetensors, .zip.")
@@ -453,27 +454,14 @@ def _bench(options: argparse.Namespace) -> None:
 
 def _check_outputs(options: argparse.Namespace) -> None:
     if "flights" in options:
-        _check_file("flights", options.flights)
+        check_file(options.flights, "flights")
     if "out" in options and os.path.exists(options.out) and not os.path.isdir(options.out):
         raise BadInput(f"out: {options.out} is a file. Give a directory.")
 
 
-def _check_file(option: str, path: Path) -> None:
-    """Refuse a file that cannot be written, before anything is flown."""
-    if not os.path.isdir(path.parent):
-        raise BadInput(f"{option}: {path.parent} is no directory. Give a file in one that exists.")
-    if os.path.isdir(path):
-        raise BadInput(f"{option}: {path} is a directory. Give a file.")
-
-
 def _write_json(path: Path, content: dict[str, Any]) -> None:
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        whole = path.with_name(path.name + ".part")
-        whole.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
-        whole.replace(path)
-    except OSError as error:
-        raise BadInput(f"out: {path} cannot be written ({error.strerror}). Give another directory.") from None
+    make_folder(path.parent)
+    write_json(path, content)
 
 
 if __name__ == "__main__":

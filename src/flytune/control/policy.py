@@ -13,6 +13,7 @@ import safetensors
 import safetensors.numpy
 from jaxtyping import Array, Float
 
+from flytune.config.files import write_bytes
 from flytune.config.pytree import label, pytree, static
 from flytune.errors import BadInput
 from flytune.task import observation
@@ -82,7 +83,11 @@ class Policy:
 
 
 def save_policy(path: Path, policy: Policy) -> None:
-    """Write a policy as safetensors; its header carries the observation, the action and what `about` says, as JSON."""
+    """Write a policy as safetensors; its header carries the observation, the action and what `about` says, as JSON.
+
+    Raises:
+        BadInput: the file cannot be written.
+    """
     tensors = {"input_scale": np.asarray(policy.input_scale)}
     for index, (weight, bias) in enumerate(zip(policy.actor.weights, policy.actor.biases, strict=True)):
         tensors[f"actor.{index}.weight"] = np.asarray(weight)
@@ -95,9 +100,7 @@ def save_policy(path: Path, policy: Policy) -> None:
         "rate": "100 Hz",
         "about": policy.about,
     }
-    whole = path.with_name(path.name + ".part")
-    safetensors.numpy.save_file(tensors, whole, metadata={HEADER: json.dumps(header, sort_keys=True)})
-    whole.replace(path)
+    write_bytes(path, safetensors.numpy.save(tensors, metadata={HEADER: json.dumps(header, sort_keys=True)}))
 
 
 def load_policy(path: Path) -> Policy:

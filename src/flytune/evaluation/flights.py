@@ -1,12 +1,13 @@
 """Flights: recorded trajectories, all a judge ever sees of a controller. NumPy only."""
 
 import dataclasses
+import io
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from flytune.errors import BadInput
+from flytune.config.files import write_bytes
 
 CRASH_DISTANCE = 10.0  # m from the target; a vehicle beyond it has crashed
 
@@ -65,13 +66,9 @@ class Flights:
         Raises:
             BadInput: the file cannot be written.
         """
-        whole = path.with_name(path.name + ".part")
-        try:
-            with whole.open("wb") as file:
-                np.savez_compressed(file, **self._arrays())
-            whole.replace(path)
-        except OSError as error:
-            raise BadInput(f"flights: {path} cannot be written ({error.strerror}). Give another file.") from None
+        content = io.BytesIO()
+        np.savez_compressed(content, **self._arrays())
+        write_bytes(path, content.getvalue(), "flights")
 
     def _arrays(self) -> dict[str, Any]:
         blocks = [np.broadcast_to(self.time[None, :, None], (*self.position.shape[:2], 1))]

@@ -12,6 +12,7 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
+from flytune.config.files import write_bytes
 from flytune.control.policy import Policy
 from flytune.errors import BadInput
 from flytune.export.untrusted.onnx_controller import OnnxController, load_onnx, read_onnx
@@ -35,15 +36,8 @@ def save_onnx(path: Path, policy: Policy) -> None:
         BadInput: the extra `onnx` is missing, the file cannot be written, or it answers otherwise; nothing is left.
     """
     content = _model(policy).SerializeToString()
-    whole = path.with_name(path.name + ".part")
-    try:
-        whole.write_bytes(content)
-        _check(read_onnx(whole.read_bytes(), str(path)), policy, path)
-        whole.replace(path)
-    except OSError as error:
-        raise BadInput(f"out: {path} cannot be written ({error.strerror}). Give another file.") from None
-    finally:
-        whole.unlink(missing_ok=True)
+    _check(read_onnx(content, str(path)), policy, path)
+    write_bytes(path, content)
 
 
 def rounding_bound(policy: Policy, observations: Float[np.ndarray, "batch 17"]) -> Float[np.ndarray, "batch 4"]:

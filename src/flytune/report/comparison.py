@@ -6,11 +6,12 @@ from pathlib import Path
 
 import numpy as np
 
+from flytune.config.files import check_file, write_text
 from flytune.errors import BadInput
 from flytune.evaluation.comparison import Comparison
 from flytune.evaluation.comparison_table import conditions, sentences
 from flytune.report import comparison_plots, comparison_tables, page, plots, tables
-from flytune.report.report import Entry, write_whole
+from flytune.report.report import Entry
 
 SAME_PLACE = 1e-4  # m; another simulator may round the start, which is metres away
 
@@ -38,7 +39,8 @@ def write_comparison(path: Path, entries: Sequence[Entry], comparison: Compariso
                 f"starts: {name} starts elsewhere, seen from its target, than {comparison.names[0]}. "
                 "Allowed: the same for every controller. Fly all of them with one --task."
             )
-    write_whole(path, lambda: _page(entries, comparison))
+    check_file(path)
+    write_text(path, _page(entries, comparison))
 
 
 def _page(entries: Sequence[Entry], comparison: Comparison) -> str:

@@ -1,14 +1,13 @@
 """The report: one self-contained page on what one or several policies fly like, and how they came to."""
 
-import contextlib
 import dataclasses
 import math
-import os
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from html import escape
 from pathlib import Path
 from typing import Any
 
+from flytune.config.files import check_file, write_text
 from flytune.errors import BadInput
 from flytune.evaluation import metrics
 from flytune.evaluation.flights import Flights
@@ -53,28 +52,8 @@ def write_report(path: Path, entries: Sequence[Entry]) -> None:
     """
     if not entries:
         raise BadInput("report: no policy. Allowed: one or more. Name a run directory, a policy file or a controller.")
-    write_whole(path, lambda: _page(entries))
-
-
-def write_whole(path: Path, make: Callable[[], str]) -> None:
-    """Write the page that `make` returns, whole or not at all; it is made only where it can be written.
-
-    Raises:
-        BadInput: the file cannot be written.
-    """
-    if not os.path.isdir(path.parent):  # unlike Path.is_dir, also where the name itself is too long
-        raise BadInput(f"out: {path.parent} is no folder. Allowed: a file in a folder that exists. Make it first.")
-    if os.path.isdir(path):
-        raise BadInput(f"out: {path} is a folder. Allowed: a file, for instance {path / 'report.html'}.")
-    text = make()
-    whole = path.with_name(path.name + ".part")
-    try:
-        whole.write_text(text, encoding="utf-8", errors="replace")  # a file name need not be valid Unicode
-        whole.replace(path)
-    except OSError as error:
-        with contextlib.suppress(OSError):
-            whole.unlink()
-        raise BadInput(f"out: {path} cannot be written ({error.strerror}). Allowed: a file you may write.") from None
+    check_file(path)
+    write_text(path, _page(entries))
 
 
 def _page(entries: Sequence[Entry]) -> str:

@@ -9,9 +9,9 @@ from typing import Any
 import plotly.graph_objects as go
 from plotly.subplots import make_subplots
 
+from flytune.config.files import check_file, write_text
 from flytune.report import style
 from flytune.report.page import drawing, page
-from flytune.report.report import write_whole
 
 
 def write_tuning(path: Path, tuning: Mapping[str, Any]) -> None:
@@ -24,7 +24,8 @@ def write_tuning(path: Path, tuning: Mapping[str, Any]) -> None:
     Raises:
         BadInput: the file cannot be written.
     """
-    write_whole(path, lambda: page("flytune tune", _body(tuning)))
+    check_file(path)
+    write_text(path, page("flytune tune", _body(tuning)))
 
 
 def _body(tuning: Mapping[str, Any]) -> str:

@@ -5,8 +5,8 @@ from collections.abc import Sequence
 from html import escape
 from pathlib import Path
 
+from flytune.config.files import check_file, write_text
 from flytune.report import page, plots, tables
-from flytune.report.report import write_whole
 from flytune.reproduction import drawings
 from flytune.reproduction.evidence import CONDITIONS, SEED, TRIALS, Evidence
 from flytune.reproduction.inconsistencies import Point
@@ -22,7 +22,8 @@ def write_page(path: Path, evidence: Evidence, verdicts: Sequence[Verdict], poin
     Raises:
         BadInput: the file cannot be written.
     """
-    write_whole(path, lambda: page.page("flytune: the paper, reproduced", _body(evidence, verdicts, points)))
+    check_file(path)
+    write_text(path, page.page("flytune: the paper, reproduced", _body(evidence, verdicts, points)))
 
 
 def verdict_table(verdicts: Sequence[Verdict]) -> list[tuple[str, str, str, str]]:

@@ -1,7 +1,6 @@
 """The whole reproduction: train what is missing, fly, judge, draw, write."""
 
 import dataclasses
-import json
 import platform
 import time
 from collections.abc import Callable
@@ -9,6 +8,7 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
+from flytune.config.files import write_json, write_text
 from flytune.reproduction.claims import claims
 from flytune.reproduction.evidence import Evidence, gather
 from flytune.reproduction.figures import write_figures
@@ -18,7 +18,6 @@ from flytune.reproduction.page import write_page
 from flytune.reproduction.study import Member, Study, open_study
 from flytune.reproduction.trainings import free_cores, train_all
 from flytune.reproduction.verdict import Verdict
-from flytune.runs.directory import write_text
 from flytune.training.loop import Progress
 
 
@@ -89,5 +88,5 @@ def _write(evidence: Evidence, started: float) -> Reproduction:
         seconds=time.monotonic() - started,
     )
     write_text(words, markdown(verdicts, contradictions))
-    write_text(record, json.dumps(result.to_dict(), indent=2) + "\n")
+    write_json(record, result.to_dict())
     return result

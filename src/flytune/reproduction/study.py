@@ -8,9 +8,10 @@ from pathlib import Path
 from typing import Any, Literal
 
 from flytune.config import document
+from flytune.config.files import make_folder, write_json
 from flytune.control.policy import load_policy
 from flytune.errors import BadInput
-from flytune.runs.directory import first_difference, read_facts, write_text
+from flytune.runs.directory import first_difference, read_facts
 from flytune.task.task import Task, load_task
 from flytune.training.loop import with_steps
 
@@ -96,11 +97,8 @@ def open_study(study: Study) -> None:
         return
     if study.folder.exists() and any(study.folder.iterdir()):
         raise BadInput(f"out: {study.folder} is not empty and holds no reproduction. Give another directory.")
-    try:
-        (study.folder / "runs").mkdir(parents=True, exist_ok=True)
-        write_text(path, json.dumps(study.plan(), indent=2) + "\n")
-    except OSError as error:
-        raise BadInput(f"out: {study.folder} cannot be written ({error.strerror}). Give another directory.") from None
+    make_folder(study.folder / "runs")
+    write_json(path, study.plan())
 
 
 def condition(study: Study, member: Member, tell: Callable[[str], None]) -> CONDITION:

@@ -12,9 +12,9 @@ from concurrent.futures import FIRST_EXCEPTION, ThreadPoolExecutor, wait
 from pathlib import Path
 from typing import Any
 
+from flytune.config.files import write_text
 from flytune.errors import BadInput, Diverged, Interrupted
 from flytune.reproduction.study import Member, Study, condition
-from flytune.runs.directory import write_text
 from flytune.task.task import write_task
 from flytune.training.loop import Progress
 

@@ -16,6 +16,7 @@ import safetensors
 import safetensors.numpy
 
 from flytune.config import document
+from flytune.config.files import make_folder, write_bytes, write_json, write_text
 from flytune.control.policy import Policy, save_policy
 from flytune.errors import BadInput
 from flytune.task.task import Task, load_task, write_task
@@ -43,12 +44,9 @@ class RunDirectory:
             return
         if holds_run:
             raise BadInput(f"out: {path} already holds a run. Give another directory, or --resume to go on with it.")
-        try:
-            path.mkdir(parents=True, exist_ok=True)
-            write_text(path / "task.toml", write_task(task))
-            self._write_facts(_facts(task, trainer, seed))
-        except OSError as error:
-            raise BadInput(f"out: {path} cannot be written ({error.strerror}). Give another directory.") from None
+        make_folder(path)
+        write_text(path / "task.toml", write_task(task))
+        write_json(path / "run.json", _facts(task, trainer, seed))
 
     def _check_same(self, task: Task, trainer: str, seed: int, holds_run: bool) -> None:
         if not holds_run:
@@ -70,11 +68,9 @@ class RunDirectory:
     def checkpoint(self, train_state: Any, rows: list[dict[str, Any]]) -> None:
         """Write everything that is needed to go on exactly, and the metrics up to here."""
         folder = self.path / "checkpoint"
-        folder.mkdir(exist_ok=True)
+        make_folder(folder)
         leaves = {f"{index:03d}": np.asarray(_raw(leaf)) for index, leaf in enumerate(jax.tree.leaves(train_state))}
-        whole = folder / "learner.safetensors.part"
-        safetensors.numpy.save_file(leaves, whole, metadata={"rows": json.dumps(rows)})
-        whole.replace(folder / "learner.safetensors")
+        write_bytes(folder / "learner.safetensors", safetensors.numpy.save(leaves, {"rows": json.dumps(rows)}))
         write_text(self.path / "metrics.jsonl", "".join(json.dumps(row) + "\n" for row in rows))
 
     def resume(self, fresh: Any) -> tuple[Any, list[dict[str, Any]]]:
@@ -100,12 +96,8 @@ class RunDirectory:
         """Write the policies and say that the run is complete; `last` is the last row of the metrics."""
         save_policy(self.path / "policy.safetensors", policy)
         save_policy(self.path / "policy-last.safetensors", last_policy)
-        self._write_facts(
-            read_facts(self.path) | {"finished": True, "steps": last["steps"], "seconds": last["seconds"]}
-        )
-
-    def _write_facts(self, facts: dict[str, Any]) -> None:
-        write_text(self.path / "run.json", json.dumps(facts, indent=2) + "\n")
+        finished = {"finished": True, "steps": last["steps"], "seconds": last["seconds"]}
+        write_json(self.path / "run.json", read_facts(self.path) | finished)
 
 
 def resume_command(path: Path, trainer: str, seed: int) -> str:
@@ -185,10 +177,3 @@ def _is_key(leaf: Any) -> bool:
 
 def _raw(leaf: Any) -> Any:
     return jax.random.key_data(leaf) if _is_key(leaf) else leaf
-
-
-def write_text(path: Path, text: str) -> None:
-    """Write a text file, whole or not at all."""
-    whole = path.with_name(path.name + ".part")
-    whole.write_text(text, encoding="utf-8")
-    whole.replace(path)

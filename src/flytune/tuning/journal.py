@@ -6,8 +6,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from flytune.config.files import make_folder, write_json
 from flytune.errors import BadInput
-from flytune.runs.directory import write_text
 from flytune.tuning.iteration import Step
 from flytune.tuning.result import Verdict
 
@@ -28,11 +28,8 @@ def write_journal(
         "schema": 1, **asked, **about, "steps": [step.to_dict() for step in steps],
         "verdicts": [dataclasses.asdict(verdict) for verdict in verdicts],
     }  # fmt: skip
-    try:
-        directory.mkdir(parents=True, exist_ok=True)
-        write_text(directory / "tune.json", json.dumps(told, indent=2) + "\n")
-    except OSError as error:
-        raise BadInput(f"out: {directory} cannot be written ({error.strerror}). Give another directory.") from None
+    make_folder(directory)
+    write_json(directory / "tune.json", told)
 
 
 def read_journal(directory: Path, asked: Mapping[str, Any]) -> tuple[list[Step], list[Verdict]]:

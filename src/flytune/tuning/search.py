@@ -1,7 +1,6 @@
 """The closed loop: fly, see what is missing, edit the task by a rule, train on from the last policy, and fly again."""
 
 import dataclasses
-import json
 import math
 import os
 import shutil
@@ -11,9 +10,10 @@ from pathlib import Path
 from typing import Any
 
 from flytune.config import document
+from flytune.config.files import write_json, write_text
 from flytune.control.policy import Policy, load_policy
 from flytune.errors import BadInput, Diverged, Interrupted
-from flytune.runs.directory import first_difference, write_text
+from flytune.runs.directory import first_difference
 from flytune.task.task import Task, load_task, write_task
 from flytune.training.loop import Progress, train
 from flytune.tuning.choose import choose
@@ -267,7 +267,7 @@ class Tuner:
         write_text(self.out / "task.toml", write_task(self.task_of(step.number, step.values, step.reasons)))
         told = next((v.judgement for v in reversed(self.verdicts) if v.step == best), None)
         if told is not None:
-            write_text(self.out / "evaluation.json", json.dumps(told, indent=2) + "\n")
+            write_json(self.out / "evaluation.json", told)
         result = Tuning(
             requirement=self.requirement, start=self.start.name, steps=self.steps, verdicts=self.verdicts, best=best,
             blocked=blocked, directory=self.out, bounds=self.bounds,
