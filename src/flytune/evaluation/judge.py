@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float
 from flytune.evaluation import lower_bounds, metrics
 from flytune.evaluation.flights import CRASH_DISTANCE, Flights
 from flytune.evaluation.statistics import finite, median, summary
-from flytune.evaluation.table import AXES, response_line, response_table
+from flytune.evaluation.table import AXES, response_line, response_text
 
 CHANNELS = (*AXES, "position")
 SECONDARY_BANDS = {"2%": 0.02, "5%": 0.05}  # of each trial's own step
@@ -117,7 +117,7 @@ class Judgement:
 
     def table(self) -> str:
         """The response table for a terminal: plain text, one row per channel, '-' where a quantile is infinite."""
-        return response_table(self.to_dict())
+        return response_text(self.to_dict())
 
     __str__ = table
 
