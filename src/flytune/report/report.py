@@ -1,21 +1,17 @@
 """The report: one self-contained page on what one or several policies fly like, and how they came to."""
 
-import dataclasses
 import math
 from collections.abc import Sequence
 from html import escape
 from pathlib import Path
-from typing import Any
 
 from flytune.config.files import check_file, write_text
 from flytune.errors import BadInput
 from flytune.evaluation import metrics
-from flytune.evaluation.flights import Flights
-from flytune.evaluation.judge import Judgement
+from flytune.evaluation.evaluate import Evaluation
 from flytune.report import page, plots, tables
 from flytune.report.learning import ends_that_never_came, learning
 from flytune.report.style import listed
-from flytune.task.task import Task
 
 SECTIONS = {
     "response": "Step response",
@@ -28,16 +24,7 @@ SECTIONS = {
 }
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class Entry:
-    """One policy to report on: what it was asked, how it flew, how that was judged, and how it was trained."""
-
-    name: str
-    task: Task
-    flights: Flights
-    judgement: Judgement
-    metrics: list[dict[str, Any]] | None  # the training curve, a row per update; None for a policy without one
-    about: dict[str, str]  # facts of the run: trainer, seed, steps, seconds, versions, command line
+Entry = Evaluation  # one controller to report on
 
 
 def write_report(path: Path, entries: Sequence[Entry]) -> None:

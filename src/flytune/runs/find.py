@@ -6,6 +6,8 @@ import os
 from pathlib import Path
 from typing import Any
 
+import jax
+
 from flytune.control.classical import CLASSICAL, classical_controller
 from flytune.control.controller import Controller
 from flytune.control.policy import load_policy
@@ -22,13 +24,32 @@ KINDS = f"a run directory, a policy file ({', '.join(READERS)}), {', '.join(CLAS
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class FoundController:
-    """A controller, the task it flies, and how it was made."""
+    """A controller, the task it flies, and how it was made; it flies like the controller itself."""
 
     name: str
     controller: Controller
     task: Task  # the one asked for, else the one it was trained for, else the baseline
     metrics: list[dict[str, Any]] | None  # its training, one row per update
     about: dict[str, str]  # facts for a reader
+
+    def initial_memory(self) -> Any:
+        """The controller's own."""
+        return self.controller.initial_memory()
+
+    def act(self, memory: Any, observation: Any) -> Any:
+        """The controller's own."""
+        return self.controller.act(memory, observation)
+
+    def __repr__(self) -> str:
+        return f"FoundController({self.name}, {self.controller!r}, for {self.task.name})"
+
+
+def _bare(_: None, children: tuple[Controller]) -> Any:
+    return children[0]
+
+
+# compiled code sees the controller alone
+jax.tree_util.register_pytree_node(FoundController, lambda found: ((found.controller,), None), _bare)
 
 
 def find_controller(name: str, task: str | Task | None = None) -> FoundController:

@@ -1,0 +1,117 @@
+"""Options that several commands share, as types; and the checks of the files a command is going to write."""
+
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from cyclopts import Parameter, Token
+
+from flytune.config.files import check_file
+from flytune.errors import BadInput
+
+TASK_HELP = "a preset (baseline, acrobatic, inspection, or one of them with -refined), or a TOML file"
+CONTROLLER_HELP = (
+    "a run directory, a policy file (.safetensors, .onnx, or a .zip of Stable-Baselines3), a policy that ships "
+    "(baseline-refined, or baseline-refined@ppo), or pid, geometric, lqr (with @textbook: gains that were not tuned)"
+)
+
+
+def whole_number(kind: type, tokens: Sequence[Token]) -> int:
+    """The whole number that was typed; digits alone, so that 3.7 is refused and not rounded."""
+    try:
+        return int(tokens[0].value)
+    except ValueError:
+        raise ValueError("a whole number") from None
+
+
+def real_number(kind: type, tokens: Sequence[Token]) -> float:
+    """The number that was typed."""
+    try:
+        return float(tokens[0].value)
+    except ValueError:
+        raise ValueError("a number") from None
+
+
+Task = Annotated[str, Parameter(name="TASK", help=TASK_HELP)]
+Controller = Annotated[str, Parameter(name="CONTROLLER", help=CONTROLLER_HELP)]
+Controllers = Annotated[tuple[str, ...], Parameter(name="CONTROLLER", help=CONTROLLER_HELP)]
+Whole = Annotated[int, Parameter(metavar="N", converter=whole_number)]
+Real = Annotated[float, Parameter(converter=real_number)]
+Flag = Annotated[bool, Parameter(negative=(), show_default=False)]
+Assignments = Annotated[
+    tuple[str, ...], Parameter(metavar="PATH=VALUE", consume_multiple=(1, None), negative=(), show_default=False)
+]
+Folder = Annotated[Path | None, Parameter(name="--out", metavar="DIR")]
+Steps = Annotated[Whole | None, Parameter(help="number of environment steps in all (default: the task's own)")]
+Edits = Annotated[Assignments, Parameter(name="--set")]
+AsJson = Annotated[Flag, Parameter(name="--json", help="print one JSON object instead of the table")]
+
+
+@Parameter(name="*")
+@dataclass(frozen=True, kw_only=True)
+class FlightOptions:
+    """How controllers are flown."""
+
+    task: Annotated[
+        str | None,
+        Parameter(metavar="TASK", help=f"the task to fly: {TASK_HELP} (default: the one it was trained for)"),
+    ] = None
+    simulator: Annotated[
+        Literal["flytune", "pybullet", "mujoco"], Parameter(name="--world", help="the simulator to fly in")
+    ] = "flytune"
+    simulator_options: Annotated[
+        Assignments,
+        Parameter(
+            name="--world-set",
+            metavar="NAME=VALUE",
+            help="options of the simulator: damping=0.04 ground_effect=true ...",
+        ),
+    ] = ()
+    trials: Annotated[Whole, Parameter(help="number of trials")] = 100
+    seed: Annotated[Whole, Parameter(help="seed of the initial conditions and of the noise")] = 1
+    duration: Annotated[
+        Real | None,
+        Parameter(metavar="S", help="length of each trial, in seconds (default: the task's own)"),
+    ] = None
+    initial_conditions: Annotated[
+        Literal["clear", "paper"],
+        Parameter(
+            name="--starts", help="initial conditions: those of the paper, or only those of them at least 0.1 m high"
+        ),
+    ] = "clear"
+
+    def settings(self) -> dict[str, Any]:
+        """The keyword arguments of `flytune.evaluate`."""
+        return {
+            "trials": self.trials,
+            "seed": self.seed,
+            "duration": self.duration,
+            "initial_conditions": self.initial_conditions,
+            "simulator": self.simulator,
+            "simulator_options": assignments(self.simulator_options),
+        }
+
+
+def assignments(texts: Sequence[str]) -> dict[str, Any]:
+    """Path and value of each PATH=VALUE; the last one of a path counts.
+
+    Raises:
+        BadInput: a text that is no assignment.
+    """
+    from flytune.config.document import parse_assignment
+
+    return dict(map(parse_assignment, texts))
+
+
+def check_outputs(folder: Path | None, flights: Path | None) -> None:
+    """Refuse a folder or a file of trajectories that cannot be written, before anything flies.
+
+    Raises:
+        BadInput: one of them cannot be written.
+    """
+    if flights is not None:
+        check_file(flights, "flights")
+    if folder is not None and os.path.exists(folder) and not os.path.isdir(folder):
+        raise BadInput(f"out: {folder} is a file. Allowed: a folder, which may be new.")

@@ -1,0 +1,52 @@
+"""`flytune reproduce`."""
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+from cyclopts import Parameter
+
+from flytune.cli.options import AsJson, Flag, Folder, Whole
+
+
+@Parameter(name="*")
+@dataclass(frozen=True, kw_only=True)
+class ReproduceOptions:
+    """How the paper is reproduced."""
+
+    trainer: Annotated[Literal["ppo", "apg"], Parameter(help="how to learn; the paper used ppo")] = "ppo"
+    seeds: Annotated[Whole, Parameter(help="number of trainings of each behaviour")] = 5
+    steps: Annotated[
+        Whole | None, Parameter(help="number of environment steps of each training (default: the task's own)")
+    ] = None
+    refined: Annotated[Flag, Parameter(help="use the refined presets instead of the printed ones")] = False
+    out: Annotated[
+        Folder,
+        Parameter(
+            help="folder of the runs, the figures, the verdicts and the page; a reproduction in it is continued "
+            "(default: runs/reproduction-TRAINER)"
+        ),
+    ] = None
+    as_json: AsJson = False
+
+
+def reproduce(*, options: ReproduceOptions = ReproduceOptions()) -> None:
+    """Run the paper again: three behaviours, every figure, and a verdict on each claim."""
+    from flytune.reproduction.reproduction import reproduce
+    from flytune.reproduction.study import Study
+    from flytune.reproduction.trainings import show_all
+
+    name = f"reproduction-{options.trainer}{'-refined' if options.refined else ''}"
+    study = Study(
+        folder=options.out or Path("runs") / name,
+        trainer=options.trainer,
+        seeds=options.seeds,
+        steps=options.steps,
+        refined=options.refined,
+    )
+    with show_all(study) as (on_progress, tell):
+        result = reproduce(study, on_progress=on_progress, tell=tell)
+    print(json.dumps(result.to_dict()) if options.as_json else result.table(), flush=True)
+    if not options.as_json:
+        print(study.folder / "report.html")

@@ -1,0 +1,51 @@
+"""`flytune train`."""
+
+from dataclasses import dataclass
+from typing import Annotated, Literal
+
+from cyclopts import Parameter
+
+from flytune.cli.options import Edits, Flag, Folder, Steps, Task, Whole, assignments
+from flytune.errors import BadInput
+
+
+@Parameter(name="*")
+@dataclass(frozen=True, kw_only=True)
+class TrainOptions:
+    """How a policy is trained."""
+
+    trainer: Annotated[
+        Literal["apg", "ppo", "sb3"],
+        Parameter(help="how to learn: analytic policy gradient, PPO, or the PPO of Stable-Baselines3"),
+    ] = "apg"
+    seed: Annotated[Whole, Parameter(help="seed of the weights, the episodes and the noise")] = 0
+    steps: Steps = None
+    out: Annotated[Folder, Parameter(help="run directory (default: a new one under runs/)")] = None
+    edits: Annotated[
+        Edits, Parameter(help="change the task: reward.velocity.weight=0.08 vehicle=crazyflie-measured ...")
+    ] = ()
+    resume: Annotated[Flag, Parameter(help="continue the training in --out from its checkpoint")] = False
+    tensorboard: Annotated[Flag, Parameter(help="write event files for TensorBoard as well")] = False
+
+
+def train(task: Task, /, *, options: TrainOptions = TrainOptions()) -> None:
+    """Train a policy for a task, and print its run directory last."""
+    from flytune.evaluation.evaluate import evaluate, write_evaluation
+    from flytune.runs.directory import new_directory
+    from flytune.task.task import load_task
+    from flytune.training.loop import train, with_steps
+    from flytune.training.progress import show_progress
+
+    wanted = load_task(task, assignments(options.edits))
+    if options.steps is not None:
+        wanted = with_steps(wanted, options.trainer, options.steps)
+    if options.resume and options.out is None:
+        raise BadInput("resume: needs --out DIR, the run to continue.")
+    out = options.out or new_directory(wanted, options.trainer, options.seed)
+    with show_progress() as on_progress:
+        run = train(wanted, options.trainer, seed=options.seed, out=out, resume=options.resume,
+                    tensorboard=options.tensorboard, on_progress=on_progress)  # fmt: skip
+    evaluation = evaluate(run.policy, wanted, name=str(out))
+    write_evaluation(out, evaluation.judgement)
+    print(evaluation.judgement.line())
+    print(out)

@@ -1,0 +1,91 @@
+"""Evaluating: controllers named or given are found, flown and judged in one call."""
+
+import dataclasses
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from flytune.config.files import make_folder, write_json
+from flytune.control.controller import Controller
+from flytune.evaluation.flights import Flights
+from flytune.evaluation.fly import fly
+from flytune.evaluation.judge import Judgement, judge
+from flytune.runs.find import FoundController, find_controller
+from flytune.task.task import Task, load_task
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
+class Evaluation:
+    """How one controller flew a task, how that was judged, and how the controller was trained."""
+
+    name: str
+    task: Task
+    flights: Flights
+    judgement: Judgement
+    metrics: list[dict[str, Any]] | None = None  # the training curve, a row per update; None for one without
+    about: dict[str, str] = dataclasses.field(default_factory=dict)  # trainer, seed, steps, versions, command line
+
+    def __str__(self) -> str:
+        return self.judgement.table()
+
+    def __repr__(self) -> str:
+        return f"Evaluation({self.judgement!r})"
+
+
+def evaluate(
+    controller: str | Controller, task: str | Path | Task | None = None, *, name: str = "", **settings: Any
+) -> Evaluation:
+    """The flights and the judgement of one controller over many trials.
+
+    Args:
+        controller: what `find_controller` takes (a run directory, a policy file, `pid`, ...), what it returns, or any
+            controller.
+        task: the task to fly: a preset, a TOML file or a Task; where None, the one the controller was trained for, or
+            the baseline for a controller that says none.
+        name: the controller's name in tables; where empty, the one it was found by.
+        **settings: of `fly`: trials, seed, duration, initial_conditions, simulator, simulator_options.
+
+    Raises:
+        BadInput: the controller, the task or a setting cannot be used.
+        Diverged: the controller returned an action that is not finite.
+    """
+    found = _find(controller, task, name)
+    flights = fly(found.controller, found.task, name=found.name, **settings)
+    return Evaluation(
+        name=found.name,
+        task=found.task,
+        flights=flights,
+        judgement=judge(flights),
+        metrics=found.metrics,
+        about=found.about,
+    )
+
+
+def evaluate_all(
+    controllers: Sequence[str | Controller], task: str | Path | Task | None = None, **settings: Any
+) -> list[Evaluation]:
+    """The evaluations of several controllers over the same trials; all of them are found before the first one flies.
+
+    The arguments and errors are those of `evaluate`.
+    """
+    return [evaluate(found, **settings) for found in [_find(controller, task) for controller in controllers]]
+
+
+def _find(controller: str | Controller, task: str | Path | Task | None, name: str = "") -> FoundController:
+    wanted = load_task(task) if isinstance(task, str | Path) else task
+    found = find_controller(controller, wanted) if isinstance(controller, str) else controller
+    if not isinstance(found, FoundController):
+        return FoundController(
+            name=name, controller=found, task=wanted or load_task("baseline"), metrics=None, about={}
+        )
+    return dataclasses.replace(found, name=name or found.name, task=wanted or found.task)
+
+
+def write_evaluation(folder: Path, judgement: Judgement) -> None:
+    """Write `evaluation.json` into a folder, which may be new.
+
+    Raises:
+        BadInput: the file cannot be written.
+    """
+    make_folder(folder)
+    write_json(folder / "evaluation.json", judgement.to_dict())
