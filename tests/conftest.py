@@ -12,23 +12,23 @@ os.environ.setdefault("XLA_FLAGS", "--xla_cpu_multi_thread_eigen=false intra_op_
 os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(Path(__file__).parents[1] / ".jax_cache"))
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.3")
 
-from beartype import beartype
+import jax
+from beartype import BeartypeConf, BeartypeHintOverrides, beartype
 from jaxtyping import install_import_hook
 from tests.chromium import BROWSERS, ON_A_MAC, Browser
 
-# without physics.vehicle, whose properties promise a float and give a tracer in compiled code, and without
-# evaluation.fly and the rooms above it, which refuse a bad argument in their own words
-CHECKED = "control, config.document, simulation.environment, physics.dynamics, physics.rotation, evaluation.judge, evaluation.metrics, task"
+# A number may be an int, and in compiled code it is a tracer.
+CHECKED = BeartypeConf(hint_overrides=BeartypeHintOverrides({float: float | int | jax.Array}))
 
 
 def check_functions(function):
     """Beartype on a function, but not on a constructor: JAX rebuilds our dataclasses with tracers in their numbers."""
-    return function if function.__name__ == "__init__" else beartype(function)
+    return function if function.__name__ == "__init__" else beartype(function, conf=CHECKED)
 
 
 sys.modules["flytune_type_checker"] = checker = ModuleType("flytune_type_checker")
 checker.check_functions = check_functions
-install_import_hook([f"flytune.{name}" for name in CHECKED.split(", ")], "flytune_type_checker.check_functions")
+install_import_hook("flytune", "flytune_type_checker.check_functions")
 
 
 @pytest.fixture

@@ -1,7 +1,7 @@
 """Worlds: simulators behind one small interface. NumPy only."""
 
 import dataclasses
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -18,6 +18,7 @@ class VehicleStates:
     rotor_speed_rpm: np.ndarray  # [N, 4] rpm
 
 
+@runtime_checkable
 class Simulator(Protocol):
     """N vehicles of one kind, side by side in a simulator; they do not touch each other."""
 
