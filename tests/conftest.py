@@ -5,6 +5,7 @@ import shutil
 import sys
 from pathlib import Path
 from types import ModuleType
+from typing import Self
 
 import pytest
 
@@ -13,12 +14,12 @@ os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(Path(__file__).parents[1]
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.3")
 
 import jax
-from beartype import BeartypeConf, BeartypeHintOverrides, beartype
+from beartype import BeartypeConf, FrozenDict, beartype
 from jaxtyping import install_import_hook
 from tests.chromium import BROWSERS, ON_A_MAC, Browser
 
-# A number may be an int, and in compiled code it is a tracer.
-CHECKED = BeartypeConf(hint_overrides=BeartypeHintOverrides({float: float | int | jax.Array}))
+# A float may be an int, and in compiled code it is a tracer. Beartype knows no Self outside of a class that it decorates.
+CHECKED = BeartypeConf(hint_overrides=FrozenDict({float: float | int | jax.Array, Self: object}))
 
 
 def check_functions(function):

@@ -1,4 +1,4 @@
-"""A policy as an ONNX file: what is in it, that it answers as the policy does, and that it flies the same flights."""
+"""A policy as an ONNX file: its content, its actions, and its flights, which are those of the policy."""
 
 import re
 import subprocess
@@ -52,7 +52,7 @@ def exported(policy, tmp_path):
     return tmp_path / "policy.onnx"
 
 
-def test_the_file_answers_ten_thousand_observations_as_the_policy_does_for_every_squash_and_size(tmp_path):
+def test_the_file_gives_the_actions_of_the_policy_for_ten_thousand_observations_every_squash_and_size(tmp_path):
     observations = sample_observations(10_000)
     sizes = [((), "tanh"), ((8,), "clip"), ((64, 64), "clip"), ((64, 64), "tanh"), ((32, 16, 8), "tanh")]
     for hidden, squash in sizes:
@@ -66,7 +66,7 @@ def test_the_file_answers_ten_thousand_observations_as_the_policy_does_for_every
         assert np.all(difference <= 2 * rounding_bound(policy, observations)), (hidden, squash)
 
 
-def test_the_bound_on_rounding_holds_against_float64_and_is_far_below_what_a_motor_could_tell():
+def test_the_bound_on_rounding_holds_against_float64_and_is_far_below_the_resolution_of_a_motor():
     observations = sample_observations(2_000)
     for squash in ("clip", "tanh"):
         policy = make_policy(squash=squash)
@@ -82,7 +82,7 @@ def test_the_bound_on_rounding_holds_against_float64_and_is_far_below_what_a_mot
         assert np.median(bound) < 2 / 65_536 * 4
 
 
-def test_the_observations_of_the_check_are_the_target_and_anything_from_millimetres_to_beyond_a_flight():
+def test_the_sample_observations_reach_from_the_target_to_far_beyond_any_flight():
     observations = sample_observations(10_000)
     np.testing.assert_array_equal(observations[0], [0, 0, 0, 0, 0, 0, 1] + [0] * 10)
     np.testing.assert_array_equal(observations, sample_observations(10_000))
@@ -93,11 +93,11 @@ def test_the_observations_of_the_check_are_the_target_and_anything_from_millimet
     assert np.abs(observations[:, 13:]).max() == 1
 
 
-def test_a_file_that_answers_otherwise_is_not_left_behind(policy, tmp_path, monkeypatch):
+def test_a_file_that_gives_other_actions_is_not_written(policy, tmp_path, monkeypatch):
     wrong = make_policy(gain=0.02, about=policy.about)
     written = export._model
     monkeypatch.setattr(export, "_model", lambda _: written(wrong))  # the wrong graph for the right policy
-    with pytest.raises(BadInput, match=r"policy\.onnx: onnxruntime answers .* otherwise") as caught:
+    with pytest.raises(BadInput, match=r"policy\.onnx: .* action of onnxruntime differs") as caught:
         save_onnx(tmp_path / "policy.onnx", policy)
     assert "\n" not in str(caught.value)
     assert list(tmp_path.iterdir()) == []
@@ -112,7 +112,7 @@ def test_a_failed_export_keeps_the_file_that_was_there(policy, exported):
     assert [path.name for path in exported.parent.iterdir()] == ["policy.onnx"]
 
 
-def test_a_place_that_cannot_be_written_is_named(policy, tmp_path):
+def test_a_path_that_cannot_be_written_is_named(policy, tmp_path):
     with pytest.raises(BadInput, match=r"out: .*nowhere.* cannot be written"):
         save_onnx(tmp_path / "nowhere" / "policy.onnx", policy)
 
@@ -122,7 +122,7 @@ def test_the_same_policy_gives_the_same_bytes(policy, exported, tmp_path):
     assert (tmp_path / "again.onnx").read_bytes() == exported.read_bytes()
 
 
-def test_the_file_has_one_input_one_output_and_says_what_they_mean(exported, task):
+def test_the_file_has_one_input_and_one_output_and_says_what_they_mean(exported, task):
     model = onnx.load(exported)
     onnx.checker.check_model(model, full_check=True)
     for values, name, size in ((model.graph.input, "observation", 17), (model.graph.output, "action", 4)):
@@ -138,7 +138,7 @@ def test_the_file_has_one_input_one_output_and_says_what_they_mean(exported, tas
 
 
 @pytest.mark.parametrize("name", preset_names())
-def test_the_task_of_every_preset_survives_the_file(name, tmp_path):
+def test_the_task_of_every_preset_is_read_back_from_the_file(name, tmp_path):
     task = load_task(name)
     save_onnx(tmp_path / "p.onnx", make_policy((8,), about={"task": name, "task_toml": write_task(task), "seed": 3}))
     about = load_onnx(tmp_path / "p.onnx").about
@@ -146,7 +146,7 @@ def test_the_task_of_every_preset_survives_the_file(name, tmp_path):
     assert write_task(read_task_text(about["task_toml"], "p.onnx")) == about["task_toml"] == write_task(task)
 
 
-def test_a_pilot_from_the_file_is_a_controller_alone_and_in_any_batch(policy, exported):
+def test_the_file_is_a_controller_for_one_observation_and_for_any_batch(policy, exported):
     controller = load_onnx(exported)
     assert isinstance(controller, Controller) and isinstance(controller, OnnxController)
     observations = jnp.asarray(sample_observations(6))
@@ -163,14 +163,14 @@ def test_a_pilot_from_the_file_is_a_controller_alone_and_in_any_batch(policy, ex
     np.testing.assert_allclose(twice.reshape(6, 4), expected, atol=allowed)
 
 
-def test_two_pilots_of_one_file_share_a_compiled_program_and_those_of_two_files_do_not(exported, tmp_path):
+def test_two_controllers_of_one_file_share_a_compiled_program_and_those_of_two_files_do_not(exported, tmp_path):
     save_onnx(tmp_path / "other.onnx", make_policy(seed=1))
     first, again, other = load_onnx(exported), load_onnx(exported), load_onnx(tmp_path / "other.onnx")
     assert jax.tree.structure(first) == jax.tree.structure(again) != jax.tree.structure(other)
     assert hash(first.session) == hash(again.session)
 
 
-def test_it_flies_the_flights_of_the_policy_it_was_made_from(policy, exported, task):
+def test_it_flies_the_flights_of_the_policy(policy, exported, task):
     learned = fly(policy, task, trials=5, duration=0.6)
     flown = fly(load_onnx(exported), task, trials=5, duration=0.6)
     # actions differ by a few 1e-7 at first; within 60 steps of a gentle policy that grows to less than 1e-5

@@ -1,4 +1,4 @@
-"""ONNX files from elsewhere: those that keep to the contract fly, and all others are refused in one line."""
+"""ONNX files from other programs: those that follow the conventions fly, all others are refused with their reason."""
 
 import os
 
@@ -39,7 +39,7 @@ def value(name, shape, kind=TensorProto.FLOAT):
 
 
 def make_model(nodes=LAYERS, inputs=None, outputs=None, opsets=("",), facts=CONVENTIONS, version=17, **weights):
-    """A model of another kind than ours: Gemm with transposed weights, Relu, another opset."""
+    """A model that differs from those that flytune writes: Gemm with transposed weights, Relu, another opset."""
     weights = {"first": FIRST, "second": SECOND, "bias": BIAS} | weights
     graph = helper.make_graph(
         nodes,
@@ -59,20 +59,21 @@ def squashed(*nodes):
     return (*LAYERS[:3], *nodes, helper.make_node("Tanh", ["more"], ["action"]))
 
 
-def refusal(content):
-    """The one line with which a file of this content is refused."""
+def assert_refused(content, *reasons):
+    """Assert that a file of this content is refused in one line that gives all these reasons."""
+    assert reasons
     content = content if isinstance(content, bytes) else content.SerializeToString()
     with pytest.raises(BadInput) as caught:
         read_onnx(content, "p.onnx")
     line = str(caught.value)
     assert line.startswith("p.onnx: ") and len(line.splitlines()) == 1 and len(line) < 600
-    return line
+    assert [reason for reason in reasons if reason not in line] == [], line
 
 
-# --- what flies ---
+# --- models that fly ---
 
 
-def test_a_model_of_another_make_flies_when_it_keeps_to_the_contract(tmp_path):
+def test_a_model_of_another_program_flies_if_it_follows_the_conventions(tmp_path):
     onnx.save(make_model(), tmp_path / "theirs.onnx")
     controller = load_onnx(tmp_path / "theirs.onnx")
     observation = sample_observations(50)[7]
@@ -82,13 +83,13 @@ def test_a_model_of_another_make_flies_when_it_keeps_to_the_contract(tmp_path):
     assert np.all(np.isfinite(flights.action)) and np.abs(flights.action[:, 1:]).min() > 0
 
 
-def test_weights_listed_among_the_inputs_and_unused_operator_sets_do_no_harm():
+def test_weights_listed_among_the_inputs_and_unused_operator_sets_are_allowed():
     inputs = [value("observation", [None, 17]), value("first", [8, 17])]
     model = make_model(inputs=inputs, opsets=("", "some.exporter"))
     assert isinstance(read_onnx(model.SerializeToString(), "p.onnx"), OnnxController)
 
 
-def test_actions_a_rounding_beyond_one_are_brought_back_into_the_box():
+def test_actions_beyond_one_by_rounding_are_clipped():
     saturated = (*LAYERS[:3], helper.make_node("Tanh", ["raw"], ["t"]), helper.make_node("Mul", ["t", "k"], ["action"]))
     model = make_model(saturated, second=1000 * SECOND, k=np.float32(1 + 1e-6))
     controller = read_onnx(model.SerializeToString(), "p.onnx")
@@ -100,7 +101,7 @@ def test_actions_a_rounding_beyond_one_are_brought_back_into_the_box():
 # --- files ---
 
 
-def test_what_is_no_readable_file_is_refused(tmp_path):
+def test_a_file_that_cannot_be_read_is_refused(tmp_path):
     (tmp_path / "folder.onnx").mkdir()
     (tmp_path / "empty.onnx").write_bytes(b"")
     (tmp_path / "text.onnx").write_text("a policy, honestly\n")
@@ -127,8 +128,8 @@ def test_a_huge_file_is_refused_without_being_read_whole(tmp_path):
 def test_every_truncation_and_other_protobufs_are_refused():
     content = make_model().SerializeToString()
     for end in range(0, len(content) - 1, 7):
-        refusal(content[:end])
-    refusal(make_model().graph.SerializeToString())
+        assert_refused(content[:end], "is not an ONNX model", "Give the file of a policy")
+    assert_refused(make_model().graph, "is not an ONNX model (it contains no graph)")
 
 
 # --- weights in other files ---
@@ -145,7 +146,7 @@ def external(tensor, location):
 def test_weights_in_another_file_are_refused_wherever_they_say_it_is(location):
     model = make_model()
     external(model.graph.initializer[0], location)
-    assert "'first' is kept in another file" in refusal(model)
+    assert_refused(model, "'first' is kept in another file")
 
 
 def test_weights_in_another_file_are_found_in_constants_subgraphs_functions_and_half_said(tmp_path, monkeypatch):
@@ -164,7 +165,7 @@ def test_weights_in_another_file_are_found_in_constants_subgraphs_functions_and_
     flag_only.graph.initializer[0].data_location = TensorProto.EXTERNAL
     entry_only.graph.initializer[0].external_data.add().key = "location"
     for model in (in_constant, in_branch, in_function, flag_only, entry_only):
-        assert "kept in another file" in refusal(model)
+        assert_refused(model, "kept in another file")
 
 
 # --- more than arithmetic ---
@@ -172,11 +173,11 @@ def test_weights_in_another_file_are_found_in_constants_subgraphs_functions_and_
 
 def test_operators_of_other_makers_loops_randomness_and_functions_are_refused():
     own = helper.make_node("Tanh", ["raw"], ["action"], domain="com.microsoft")
-    assert "'com.microsoft::Tanh' is not allowed" in refusal(
-        make_model((*LAYERS[:3], own), opsets=("", "com.microsoft"))
+    assert_refused(
+        make_model((*LAYERS[:3], own), opsets=("", "com.microsoft")), "'com.microsoft::Tanh' is not allowed"
     )
     noise = helper.make_node("RandomNormalLike", ["raw"], ["more"])
-    assert "'RandomNormalLike' is not allowed" in refusal(make_model(squashed(noise)))
+    assert_refused(make_model(squashed(noise)), "'RandomNormalLike' is not allowed")
     body = helper.make_graph(
         [helper.make_node("Identity", ["go"], ["on"])],
         "for_ever",
@@ -184,18 +185,18 @@ def test_operators_of_other_makers_loops_randomness_and_functions_are_refused():
         [value("on", [], TensorProto.BOOL)],
     )
     loop = helper.make_node("Loop", ["", "yes"], [], body=body)
-    assert "'Loop' is not allowed" in refusal(make_model((loop, *LAYERS), yes=np.array(True)))
+    assert_refused(make_model((loop, *LAYERS), yes=np.array(True)), "'Loop' is not allowed")
     with_function = make_model()
     with_function.functions.append(helper.make_function("own", "F", ["x"], ["x"], [], [helper.make_opsetid("", 17)]))
-    assert "holds functions" in refusal(with_function)
+    assert_refused(with_function, "contains functions")
 
 
-def test_a_small_file_that_wants_all_memory_is_refused():
+def test_a_small_file_that_would_need_all_memory_is_refused():
     doubled = [helper.make_node("Concat", [f"x{i}", f"x{i}"], [f"x{i + 1}"], axis=1) for i in range(40)]
     back = helper.make_node("Slice", ["x40", "zero", "four", "one"], ["more"])
     start = helper.make_node("Identity", ["raw"], ["x0"])
     ends = {name: np.array([number]) for name, number in (("zero", 0), ("four", 4), ("one", 1))}
-    assert "makes" in refusal(make_model(squashed(start, *doubled, back), **ends))
+    assert_refused(make_model(squashed(start, *doubled, back), **ends), "numbers per observation. Allowed: up to 1000000")
 
 
 # --- other inputs, outputs, conventions ---
@@ -209,7 +210,7 @@ def test_a_small_file_that_wants_all_memory_is_refused():
         ({"outputs": [value("action", ["n", 4]), value("raw", ["n", 4])]}, "has the outputs 'action', 'raw'"),
         ({"inputs": [value("observation", ["n", 12])], "first": FIRST[:, :12]}, r"has shape ['n', 12]"),
         ({"inputs": [value("observation", [17])]}, "has shape [17]"),
-        ({"inputs": [value("observation", [1, 17])]}, "takes a batch of 1 only"),
+        ({"inputs": [value("observation", [1, 17])]}, "has the fixed batch size 1"),
         ({"inputs": [value("observation", ["n", 17], TensorProto.DOUBLE)]}, "is of type DOUBLE"),
         ({"outputs": [value("action", ["n", 2])], "second": SECOND[:2]}, r"has shape ['n', 2]"),
         ({"facts": {}}, "entry 'observation' is missing"),
@@ -222,18 +223,17 @@ def test_a_model_for_something_else_is_refused_with_what_it_has_and_what_is_want
     nodes = list(LAYERS)
     if change.get("inputs") and change["inputs"][0].name == "obs":
         nodes[0] = helper.make_node("Gemm", ["obs", "first", "bias"], ["sum"], transB=1)
-    line = refusal(make_model(nodes, **change))
-    assert reason in line
+    assert_refused(make_model(nodes, **change), reason)
 
 
-def test_the_refusal_of_unsaid_conventions_names_the_entry_to_set_and_its_text():
-    line = refusal(make_model(facts={}))
-    assert repr(CONVENTIONS["observation"]) in line and "set_model_props" in line
+def test_the_refusal_of_missing_conventions_names_the_entry_to_set_and_its_text():
+    assert_refused(make_model(facts={}), repr(CONVENTIONS["observation"]), "set_model_props")
 
 
-def test_metadata_that_is_no_text_is_refused():
+@pytest.mark.parametrize("text", [b"task", b"baseline"])
+def test_metadata_that_is_not_text_is_refused(text):
     content = make_model(facts=CONVENTIONS | {"task": "baseline"}).SerializeToString()
-    assert "damaged metadata" in refusal(content.replace(b"baseline", b"base\xff\xfe\xfde"))
+    assert_refused(content.replace(text, text[:-3] + b"\xff\xfe\xfd"), "damaged metadata")
 
 
 # --- numbers ---
@@ -243,39 +243,41 @@ def test_metadata_that_is_no_text_is_refused():
 def test_weights_that_are_not_finite_are_refused_in_initializers_constants_and_attributes(bad):
     broken = SECOND.copy()
     broken[2, 3] = bad
-    assert "'second' holds numbers that are not finite" in refusal(make_model(second=broken))
+    assert_refused(make_model(second=broken), "'second' contains numbers that are not finite")
     constant = helper.make_node("Constant", [], ["second"], value=numpy_helper.from_array(broken, "inside"))
-    assert "'inside' holds numbers that are not finite" in refusal(make_model((constant, *LAYERS), second=None))
+    assert_refused(make_model((constant, *LAYERS), second=None), "'inside' contains numbers that are not finite")
     scalar = helper.make_node("Constant", [], ["c"], value_float=bad)
     more = helper.make_node("Mul", ["raw", "c"], ["more"])
-    assert "'value_float' holds numbers that are not finite" in refusal(make_model(squashed(scalar, more)))
+    assert_refused(make_model(squashed(scalar, more)), "'value_float' contains numbers that are not finite")
 
 
-def test_answers_that_are_not_finite_too_large_or_depend_on_the_rest_of_the_batch_are_refused():
+def test_actions_that_are_not_finite_too_large_or_depend_on_the_rest_of_the_batch_are_refused():
     nothing = helper.make_node("Log", ["raw"], ["more"])
-    assert "an action that is not" in refusal(make_model(squashed(nothing)))
+    assert_refused(make_model(squashed(nothing)), "gives an action that is not finite")
     unsquashed = (*LAYERS[:3], helper.make_node("Mul", ["raw", "gain"], ["action"]))
-    line = refusal(make_model(unsquashed, gain=np.float32(100)))
-    assert "Allowed: -1 to 1" in line
+    assert_refused(make_model(unsquashed, gain=np.float32(100)), "gives actions up to", "Allowed: -1 to 1")
     together = helper.make_node("Softmax", ["raw"], ["action"], axis=0)
-    assert "alone in its batch" in refusal(make_model((*LAYERS[:3], together)))
+    assert_refused(make_model((*LAYERS[:3], together)), "alone in its batch")
 
 
-def test_what_onnxruntime_cannot_run_is_refused():
+def test_a_model_that_onnxruntime_cannot_run_is_refused():
     one_row = helper.make_node("Reshape", ["raw", "shape"], ["more"])
-    assert "onnxruntime cannot run it" in refusal(make_model(squashed(one_row), shape=np.array([1, 4])))
-    assert refusal(make_model(version=99))
+    assert_refused(make_model(squashed(one_row), shape=np.array([1, 4])), "onnxruntime cannot run it")
+    # which of the two refuses an operator set of the future depends on the version of onnx
+    with pytest.raises(BadInput, match=r"onnxruntime cannot run it|is a damaged ONNX model"):
+        read_onnx(make_model(version=99).SerializeToString(), "p.onnx")
 
 
-def test_tensors_that_hold_no_numbers_or_less_than_their_shape_says_are_refused():
+def test_tensors_of_text_or_with_fewer_numbers_than_their_shape_are_refused():
     short = make_model()
     short.graph.initializer[0].raw_data = short.graph.initializer[0].raw_data[:-4]
-    refusal(short)
-    words = make_model(first=np.array([["a"] * 17] * 8, dtype=object))
-    refusal(words)
+    assert_refused(short, "damaged", "first")
+    assert_refused(make_model(first=np.array([["a"] * 17] * 8, dtype=object)), "is a damaged ONNX model")
+    unused = make_model(unused=np.array(["a"], dtype=object))
+    assert_refused(unused, "'unused' has a type that is not allowed. Allowed: FLOAT")
 
 
-# --- chance ---
+# --- random damage ---
 
 
 @pytest.fixture(scope="module")
@@ -290,7 +292,7 @@ def good():
     max_examples=400, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture], derandomize=True
 )
 @given(data=st.data())
-def test_a_file_damaged_anywhere_is_a_pilot_that_answers_or_one_line(good, data):
+def test_a_file_damaged_anywhere_is_refused_in_one_line_or_gives_finite_actions(good, data):
     content = bytearray(good)
     for _ in range(data.draw(st.integers(1, 4))):
         position = data.draw(st.integers(0, len(content) - 1))
@@ -299,10 +301,8 @@ def test_a_file_damaged_anywhere_is_a_pilot_that_answers_or_one_line(good, data)
     try:
         controller = read_onnx(bytes(content[:cut]), "p.onnx")
     except BadInput as refused:
-        lines = str(refused).splitlines()
+        assert str(refused).startswith("p.onnx: ") and len(str(refused).splitlines()) == 1
     else:
-        lines = ["a controller"]
         assert all(isinstance(text, str) for text in controller.about.values())
         actions = controller.session(sample_observations(20))
         assert actions.shape == (20, 4) and np.all(np.isfinite(actions))
-    assert len(lines) == 1

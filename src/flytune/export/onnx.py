@@ -1,7 +1,8 @@
-"""Policies as ONNX files: written here, read by `load_onnx`.
+"""Policies as ONNX files: `save_onnx` writes them, `load_onnx` reads them.
 
-One input `observation`, float32 [batch, 17], and one output `action`, float32 [batch, 4] in [-1, 1]; scaling and
-squashing are inside. The metadata says what the numbers mean, which task and which vehicle they are for.
+The graph has one input `observation`, float32 [batch, 17], and one output `action`, float32 [batch, 4] in [-1, 1]. It
+contains the scaling of the observation and the squashing of the action. The metadata says what the numbers mean, and
+for which task and vehicle the policy was trained.
 """
 
 from importlib import metadata
@@ -22,18 +23,19 @@ from flytune.task.observation import SIZE
 
 __all__ = ["CONVENTIONS", "OnnxController", "load_onnx", "rounding_bound", "save_onnx"]
 
-# Of December 2020: read by onnxruntime 1.6 and everything since, and nothing in the graph has changed after it.
+# From December 2020: onnxruntime 1.6 and every later version read it, and no operator of the graph has changed since.
 OPERATOR_SET, INTERMEDIATE_REPRESENTATION = 13, 7
-CHECKED = 10_000  # observations on which the file must answer as the policy does
+CHECKED = 10_000  # observations for which the file must give the actions of the policy
 UNIT_ROUNDOFF = 2.0**-24  # of float32
 TANH_ERROR = 8 * UNIT_ROUNDOFF  # measured: 5.5 in onnxruntime 1.32, 4.6 in XLA, over all of [-12, 12]
 
 
 def save_onnx(path: Path, policy: Policy) -> None:
-    """Write a policy as ONNX, once onnxruntime answers from the file as the policy does; same policy, same bytes.
+    """Write a policy as ONNX, after a check that onnxruntime computes its actions; the same policy gives the same bytes.
 
     Raises:
-        BadInput: the extra `onnx` is missing, the file cannot be written, or it answers otherwise; nothing is left.
+        BadInput: the extra `onnx` is missing, the file cannot be written, or onnxruntime computes other actions. An
+            earlier file at this path is then untouched.
     """
     content = _model(policy).SerializeToString()
     _check(read_onnx(content, str(path)), policy, path)
@@ -41,12 +43,12 @@ def save_onnx(path: Path, policy: Policy) -> None:
 
 
 def rounding_bound(policy: Policy, observations: Float[np.ndarray, "batch 17"]) -> Float[np.ndarray, "batch 4"]:
-    """How far float32 may take each action from the exact one, whatever the order of its sums.
+    """The largest error that float32 can cause in each action, for any order of its sums.
 
         |fl(x w + b) - (x w + b)| <= gamma (|x| |w| + |b|) + e |w|,   gamma = k u / (1 - k u), k = inputs + 1
         |tanh(z + e) - tanh(z)| <= e / cosh(max(|z| - e, 0))^2
 
-    with u = 2^-24, e the error of what comes in, and `TANH_ERROR` for the tanh routine itself.
+    with u = 2^-24, e the error of the input of a layer, and `TANH_ERROR` for the tanh routine itself.
 
     Source: Higham 2002, Accuracy and Stability of Numerical Algorithms, section 3.1; the mean value theorem.
     """
@@ -69,11 +71,11 @@ def rounding_bound(policy: Policy, observations: Float[np.ndarray, "batch 17"]) 
 def _check(controller: OnnxController, policy: Policy, path: Path) -> None:
     observations = sample_observations(CHECKED)
     difference = np.abs(controller.session(observations) - np.asarray(jax.jit(policy.__call__)(observations)))
-    allowed = 2 * rounding_bound(policy, observations)  # each of the two may be that far from the exact action
+    allowed = 2 * rounding_bound(policy, observations)  # each of the two actions may have this error
     if not np.all(difference <= allowed):
         row, motor = np.unravel_index(np.argmax(difference - allowed), difference.shape)
         raise BadInput(
-            f"{path}: onnxruntime answers sample observation {row} otherwise than the policy, by "
+            f"{path}: for sample observation {row}, the action of onnxruntime differs from that of the policy by "
             f"{difference[row, motor]:.2g} at motor {motor}. Allowed: {allowed[row, motor]:.2g}, the rounding of "
             "float32. Nothing was written; try another version of onnxruntime."
         )
@@ -100,7 +102,7 @@ def _model(policy: Policy) -> Any:
         value = node("Add", value, weight(f"{layer}.bias", bias), output=f"{layer}.sum")
         if index < last or policy.squash == "tanh":
             value = node("Tanh", value, output=f"{layer}.tanh")
-    # after a tanh as well: that of onnxruntime oversteps 1 by two units in the last place
+    # needed after a tanh as well: the tanh of onnxruntime exceeds 1 by two units in the last place
     node("Clip", value, weight("least", -1.0), weight("most", 1.0), output=OUTPUT)
     graph = helper.make_graph(
         nodes,

@@ -1,1 +1,1 @@
-"""Readers of files that strangers wrote; nothing in such a file is run before it was inspected."""
+"""Readers of files from untrusted sources; each file is inspected before any part of it is run."""

@@ -1,7 +1,7 @@
-"""What makes a file no policy: everything that can be told from its bytes, before anything in it is run.
+"""The inspection of an ONNX file before any part of it is run.
 
-A model may come from anywhere. It may name other files for its weights, loop for ever, or draw random numbers; none
-of that belongs into a policy, so only arithmetic that is known to be harmless is let through.
+A model may come from an untrusted source. It may name other files for its weights, loop without end, or draw random
+numbers. A policy needs none of these, so only arithmetic that is known to be harmless is allowed.
 """
 
 import math
@@ -26,27 +26,28 @@ OPERATORS = {
     "ThresholdedRelu", "Transpose", "Unsqueeze", "Where",
 }
 # fmt: on
-WIDEST = 1_000_000  # numbers that one node may make of one observation; the paper's network makes 64
+WIDEST = 1_000_000  # numbers that one node may compute from one observation; a layer of the paper computes 64
 NUMBERS = ("FLOAT", "FLOAT16", "DOUBLE", "INT32", "INT64", "BOOL")
 
 
 def inspect(content: bytes, where: str) -> Any:
-    """The model in the bytes of a file, when nothing speaks against running it; no other file is opened.
+    """The model in the bytes of a file, if it may be run; no other file is opened.
 
     Raises:
-        BadInput: not ONNX, more than arithmetic, weights elsewhere or not finite, not from observation to action.
+        BadInput: the file is not ONNX, contains more than arithmetic, keeps weights in another file, has numbers that
+            are not finite, or does not map an observation to an action.
     """
     onnx = require("onnx", "onnx")
     try:
         model = onnx.load_model_from_string(content)
-    except Exception as error:  # of several kinds, one for each way in which protobuf gives up
+    except Exception as error:  # protobuf raises exceptions of several classes
         raise BadInput(f"{where}: is not an ONNX model ({first_line(error)}). Give the file of a policy.") from None
     if not model.graph.node:
-        raise BadInput(f"{where}: is not an ONNX model (there is no graph in it). Give the file of a policy.")
-    model.DiscardUnknownFields()  # what has not been looked at is not run either
+        raise BadInput(f"{where}: is not an ONNX model (it contains no graph). Give the file of a policy.")
+    model.DiscardUnknownFields()  # a field that was not inspected must not be run
     _refuse_other_files(onnx, model, where)
     _refuse_more_than_arithmetic(onnx, model, where)
-    _refuse_other_ends(onnx, model.graph, where)
+    _refuse_other_inputs_and_outputs(onnx, model.graph, where)
     try:
         onnx.checker.check_model(model, full_check=True)
         inferred = onnx.shape_inference.infer_shapes(model, data_prop=True)
@@ -64,13 +65,13 @@ def metadata(model: Any) -> dict[str, str]:
 
 
 def first_line(error: Exception) -> str:
-    """What an error of another package says, cut down to part of a line."""
+    """The message of an error of another package, as one line of at most 150 characters."""
     text = " ".join(str(error).split())
     return text if len(text) <= 150 else f"{text[:150]}..."
 
 
 def _messages(message: Any) -> Iterator[Any]:
-    """A protobuf message and all those inside it, whatever field they hide in."""
+    """A protobuf message and all messages inside it, in any field."""
     yield message
     for field, value in message.ListFields():
         if field.message_type is not None:
@@ -86,15 +87,15 @@ def _refuse_other_files(onnx: Any, model: Any, where: str) -> None:
     for tensor in _tensors(onnx, model):
         if tensor.external_data or tensor.data_location == onnx.TensorProto.EXTERNAL:
             raise BadInput(
-                f"{where}: tensor {_shown(tensor.name)} is kept in another file, which is not allowed. "
-                "Allowed: all weights inside. Save it with onnx.save(onnx.load(path), path)."
+                f"{where}: tensor {_shown(tensor.name)} is kept in another file. "
+                "Allowed: all weights inside this file. Save it with onnx.save(onnx.load(path), path)."
             )
 
 
 def _refuse_more_than_arithmetic(onnx: Any, model: Any, where: str) -> None:
     if model.functions or model.training_info or model.graph.sparse_initializer:
         raise BadInput(
-            f"{where}: holds functions, training or sparse weights, which are not allowed. "
+            f"{where}: contains functions, training information or sparse weights. "
             "Allowed: one graph of standard operators. Export it for inference, with functions inlined."
         )
     for node in (message for message in _messages(model) if isinstance(message, onnx.NodeProto)):
@@ -106,11 +107,11 @@ def _refuse_more_than_arithmetic(onnx: Any, model: Any, where: str) -> None:
             )
 
 
-def _refuse_other_ends(onnx: Any, graph: Any, where: str) -> None:
-    weights = {tensor.name for tensor in graph.initializer}  # old models list them among the inputs
+def _refuse_other_inputs_and_outputs(onnx: Any, graph: Any, where: str) -> None:
+    weights = {tensor.name for tensor in graph.initializer}  # old models list weights among the inputs as well
     inputs = [value for value in graph.input if value.name not in weights]
     for kind, found, name, size in (("input", inputs, INPUT, SIZE), ("output", list(graph.output), OUTPUT, 4)):
-        wanted = f"Allowed: one {kind} {name!r}, float32 [batch, {size}]. Export it so."
+        wanted = f"Allowed: one {kind} {name!r}, float32 [batch, {size}]. Export it with this one."
         if [value.name for value in found] != [name]:
             names = ", ".join(_shown(value.name) for value in found) or "none"
             raise BadInput(f"{where}: has the {kind}s {names}. {wanted}")
@@ -123,8 +124,8 @@ def _refuse_other_ends(onnx: Any, graph: Any, where: str) -> None:
             raise BadInput(f"{where}: {kind} {name!r} has shape {_shown(shape)}. {wanted}")
         if isinstance(shape[0], int):
             raise BadInput(
-                f"{where}: {kind} {name!r} takes a batch of {shape[0]} only. Allowed: any batch, so that many trials "
-                "are flown at once. Export it with a dynamic first axis."
+                f"{where}: {kind} {name!r} has the fixed batch size {shape[0]}. Allowed: any batch size, since many "
+                "trials are flown at once. Export it with a dynamic first axis."
             )
 
 
@@ -132,18 +133,18 @@ def _refuse_wide_nodes(inferred: Any, where: str) -> None:
     for value in inferred.graph.value_info:
         width = math.prod(size.dim_value or 1 for size in value.type.tensor_type.shape.dim)
         if width > WIDEST:
-            raise BadInput(f"{where}: node {_shown(value.name)} makes {width} numbers. Allowed: up to {WIDEST}.")
+            raise BadInput(f"{where}: node {_shown(value.name)} computes {width} numbers per observation. Allowed: up to {WIDEST}.")
 
 
 def _refuse_other_conventions(model: Any, where: str) -> None:
-    found = metadata(model)
-    if not all(isinstance(text, str) for text in (*found, *found.values())):
+    if not all(isinstance(text, str) for entry in model.metadata_props for text in (entry.key, entry.value)):
         raise BadInput(f"{where}: has damaged metadata (bytes that are not UTF-8). Export it again.")
+    found = metadata(model)
     for key, wanted in CONVENTIONS.items():
         if found.get(key) != wanted:
             has = f"is {_shown(found[key])}" if key in found else "is missing"
             raise BadInput(
-                f"{where}: the metadata entry {key!r} {has}. Allowed: {wanted!r}. If the model keeps to that, set it: "
+                f"{where}: the metadata entry {key!r} {has}. Allowed: {wanted!r}. If the model follows this, set it: "
                 "onnx.helper.set_model_props(model, flytune.export.onnx.CONVENTIONS)."
             )
 
@@ -152,10 +153,10 @@ def _refuse_broken_numbers(onnx: Any, model: Any, where: str) -> None:
     allowed = {getattr(onnx.TensorProto, name) for name in NUMBERS}
     for tensor in _tensors(onnx, model):
         if tensor.data_type not in allowed:
-            raise BadInput(f"{where}: tensor {_shown(tensor.name)} holds no numbers. Allowed: {', '.join(NUMBERS)}.")
+            raise BadInput(f"{where}: tensor {_shown(tensor.name)} has a type that is not allowed. Allowed: {', '.join(NUMBERS)}.")
         try:
             values = onnx.numpy_helper.to_array(tensor)
-        except Exception as error:  # its size does not fit its shape
+        except Exception as error:  # its size does not match its shape
             shown = f"{_shown(tensor.name)} is damaged ({first_line(error)})"
             raise BadInput(f"{where}: tensor {shown}. Export it again.") from None
         _refuse_not_finite(values, f"tensor {_shown(tensor.name)}", where)
@@ -165,10 +166,10 @@ def _refuse_broken_numbers(onnx: Any, model: Any, where: str) -> None:
 
 def _refuse_not_finite(values: np.ndarray, what: str, where: str) -> None:
     if not np.all(np.isfinite(values)):
-        raise BadInput(f"{where}: {what} holds numbers that are not finite. Train it again.")
+        raise BadInput(f"{where}: {what} contains numbers that are not finite. Train it again.")
 
 
 def _shown(value: Any) -> str:
-    """A foreign text on one line, not longer than a reader wants."""
+    """A text of the file on one line of at most 80 characters."""
     text = repr(value)
     return text if len(text) <= 80 else f"{text[:80]}..."

@@ -1,4 +1,4 @@
-"""What a policy in ONNX is - names, metadata - and how one is asked for actions."""
+"""The conventions of a policy in ONNX (names, metadata), and a session of onnxruntime that computes its actions."""
 
 import hashlib
 
@@ -10,20 +10,20 @@ from flytune.extras import require
 from flytune.task.observation import LAYOUT, SIZE
 
 INPUT, OUTPUT = "observation", "action"
-FORMAT, VERSION = "format", "flytune_version"  # entries that say who wrote the file
-# what the numbers mean is nowhere in a graph: a model without these entries in its metadata is not flown
+FORMAT, VERSION = "format", "flytune_version"  # metadata entries that say which program wrote the file
+# A graph does not say what its numbers mean: a model without these entries in its metadata is refused.
 CONVENTIONS = {"observation": LAYOUT, "action": ACTION, "rate": "100 Hz"}
 
 
 class Session:
-    """A model that answers; two of the same content are equal, so that one compiled program serves both."""
+    """A model loaded in onnxruntime; two sessions of the same content are equal, so they share a compiled program."""
 
     def __init__(self, content: bytes) -> None:
         onnxruntime = require("onnxruntime", "onnx")
         options = onnxruntime.SessionOptions()
-        # a network this small is answered within microseconds, and one thread repeats its sums bit by bit
+        # a network this small needs microseconds, and a single thread repeats its sums bit by bit
         options.intra_op_num_threads = options.inter_op_num_threads = 1
-        options.log_severity_level = 4  # what goes wrong comes as an exception
+        options.log_severity_level = 4  # log nothing: every failure is also an exception
         options.add_session_config_entry("session.load_model_format", "ONNX")
         self._session = onnxruntime.InferenceSession(content, options, providers=["CPUExecutionProvider"])
         self._digest = hashlib.sha256(content).digest()
@@ -40,19 +40,19 @@ class Session:
 
 
 def sample_observations(number: int) -> Float[np.ndarray, "number 17"]:
-    """Observations to ask a model, the same ones each time: from millimetres around the target to far beyond a flight.
+    """Observations to test a model with, the same ones each time: from close to the target to far beyond any flight.
 
-    The first is the target itself. The others have, each drawn evenly on a logarithmic scale, an error of 1 mm to
-    100 m, a tilt from thousandths of a radian to upside down, 1 mm/s to 100 m/s, and 0.01 to 1,000 rad/s.
+    The first is hover at the target. In the others each size is log-uniform: a position error of 1 mm to 100 m, a
+    rotation of thousandths of a radian to upside down, 1 mm/s to 100 m/s, and 0.01 to 1,000 rad/s.
     """
     random = np.random.default_rng(0)
 
-    def spread(least: float, most: float, width: int) -> np.ndarray:
-        return 10 ** random.uniform(least, most, (number, 1)) * random.standard_normal((number, width))
+    def spread(low: float, high: float, width: int) -> np.ndarray:
+        return 10 ** random.uniform(low, high, (number, 1)) * random.standard_normal((number, width))
 
     attitude = np.concatenate([spread(-3, 1, 3), np.ones((number, 1))], axis=-1)
     attitude /= np.linalg.norm(attitude, axis=-1, keepdims=True)
-    last_action = np.clip(1.5 * random.uniform(-1, 1, (number, 4)), -1, 1)  # a third of them on the edge
+    last_action = np.clip(1.5 * random.uniform(-1, 1, (number, 4)), -1, 1)  # a third of them at a bound
     blocks = [spread(-3, 2, 3), attitude, spread(-3, 2, 3), spread(-2, 3, 3), last_action]
     observations = np.concatenate(blocks, axis=-1).astype(np.float32)
     observations[0] = np.eye(SIZE)[6]  # no error, and the attitude (0, 0, 0, 1)

@@ -1,4 +1,4 @@
-"""A policy that Stable-Baselines3 trained elsewhere, read from the .zip its `model.save` wrote, without trusting it."""
+"""A policy trained with Stable-Baselines3, read from the .zip of its `model.save` without unpickling any object."""
 
 import collections
 import io
@@ -16,8 +16,8 @@ from flytune.control.policy import Network, Policy
 from flytune.errors import BadInput
 from flytune.task.observation import SIZE
 
-LARGEST = 16 * 2**20  # bytes of what is read; the paper's actor and critic take 50 kB
-LARGEST_INDEX = 2**16  # bytes of the list of tensors; 2 kB in the paper's
+LARGEST = 16 * 2**20  # bytes that are read of one member; actor and critic of the paper take 50 kB
+LARGEST_INDEX = 2**16  # bytes of the list of tensors; 2 kB for the networks of the paper
 ENTRIES = 1000  # files in an archive; SB3 writes 6, and one per tensor inside policy.pth
 HARMLESS = {"net_arch", "activation_fn", "ortho_init", "log_std_init", "optimizer_class", "optimizer_kwargs"}
 REMEDY = "Give a PPO model with an MlpPolicy, tanh, and flytune's 17 observations and 4 actions, from model.save."
@@ -26,15 +26,16 @@ REMEDY = "Give a PPO model with an MlpPolicy, tanh, and flytune's 17 observation
 def load_sb3(path: Path) -> Policy:
     """The policy of a Stable-Baselines3 PPO (or A2C) model: the mean of its Gaussian, clipped into [-1, 1].
 
-    Weights only: no object of the file is unpickled, and no flag allows it. `data` is read as the JSON that it also
-    is, and the list of tensors by a reader that knows three names and has harmless stand-ins for them. `torch.load`
-    is not used, since crafted files could run code through it also with `weights_only=True` (CVE-2025-32434 before
-    torch 2.6, CVE-2026-24747 before 2.10); so neither torch nor Stable-Baselines3 need be installed.
+    Only weights are read: no object of the file is unpickled, and no option allows it. The member `data` is read as
+    JSON, and the list of tensors by a reader that accepts three names and replaces them by harmless stand-ins.
+    `torch.load` is not used, since crafted files could run code through it even with `weights_only=True`
+    (CVE-2025-32434 before torch 2.6, CVE-2026-24747 before 2.10). Neither torch nor Stable-Baselines3 is needed.
 
-    Whether observations were scaled by VecNormalize cannot be seen in this file; such a policy does not fly here.
+    The file does not say whether VecNormalize scaled the observations; a policy trained that way does not fly here.
 
     Raises:
-        BadInput: missing, damaged, foreign, too large, of another architecture or size, or not finite.
+        BadInput: the file is missing, damaged, too large or not such a model, has another architecture or size, or
+            contains numbers that are not finite.
     """
     try:
         with zipfile.ZipFile(path) as archive:
@@ -46,7 +47,7 @@ def load_sb3(path: Path) -> Policy:
         raise BadInput(f"{path}: no such file. {REMEDY}") from None
     except BadInput as error:
         raise BadInput(f"{path}: {error} {REMEDY}") from None
-    # a damaged archive breaks in as many ways as zipfile, json and pickle have lines
+    # for a damaged archive, zipfile, json and pickle raise exceptions of many classes
     except Exception as error:
         reason = " ".join(str(error).split())[:200] or type(error).__name__
         raise BadInput(f"{path}: is not a Stable-Baselines3 model ({reason}). {REMEDY}") from None
@@ -69,7 +70,7 @@ def _check_size(archive: zipfile.ZipFile, largest: float) -> None:
 
 
 def _member(archive: zipfile.ZipFile, name: str, largest: int = LARGEST) -> bytes:
-    """The bytes of one member, found by its exact name and never written anywhere."""
+    """The bytes of one member, found by its exact name and never written to a file."""
     try:
         information = archive.getinfo(name)
     except KeyError:
@@ -81,7 +82,7 @@ def _member(archive: zipfile.ZipFile, name: str, largest: int = LARGEST) -> byte
 
 
 def _tensors(content: bytes) -> dict[str, np.ndarray]:
-    """The float32 tensors of a file that torch.save wrote, without torch.
+    """The float32 tensors of a file that torch.save wrote, read without torch.
 
     The file is a zip with one folder: `data.pkl`, a pickled dictionary of tensors that name their storages, `data/KEY`,
     the numbers of each storage, and `byteorder`.
@@ -98,31 +99,32 @@ def _tensors(content: bytes) -> dict[str, np.ndarray]:
             raise BadInput("its policy.pth has another byte order, allowed: little.")
         found = _Index(io.BytesIO(_member(archive, f"{folder}/data.pkl", LARGEST_INDEX))).load()
         if not isinstance(found, dict) or not all(isinstance(value, _Tensor) for value in found.values()):
-            raise BadInput("its policy.pth holds something else than a table of tensors.")
+            raise BadInput("its policy.pth does not contain a table of tensors.")
         keys = {tensor.storage for tensor in found.values()}
         storages = {key: np.frombuffer(_member(archive, f"{folder}/data/{key}"), "<f4") for key in keys}
         return {str(name): _numbers(storages[tensor.storage], tensor) for name, tensor in found.items()}
 
 
 class _Tensor:
-    """Where the numbers of a tensor lie; what torch's rebuilding function is read as."""
+    """The place of a tensor's numbers in the file; it stands in for the function of torch that rebuilds a tensor."""
 
     def __init__(self, storage: Any, offset: Any, size: Any, stride: Any, *rest: Any) -> None:
         self.storage, self.offset, self.size, self.stride = storage, offset, size, stride
 
 
 class _Index(pickle._Unpickler):
-    """A reader of the list of tensors that can make dictionaries and `_Tensor`s, and call nothing else.
+    """A reader of the list of tensors that can only make dictionaries and `_Tensor`s.
 
-    The interpreter's own, in Python: the one in C gives a file's largest memo number as much memory as it asks for.
+    It builds on the unpickler written in Python: the one in C allocates as much memory as the largest memo number
+    of a file asks for.
     """
 
     def find_class(self, module: str, name: str) -> Any:
-        """The stand-in for one of the three names torch.save writes for a table of float32 tensors."""
+        """The stand-in for one of the three names that torch.save writes for a table of float32 tensors."""
         if (module, name) == ("collections", "OrderedDict"):
             return collections.OrderedDict
         if (module, name) == ("torch._utils", "_rebuild_tensor_v2"):
-            # made anew each time, so that a file can change nothing that stays
+            # a new function each time, so that a file cannot change anything that outlives it
             return lambda *parts: _Tensor(*parts)  # noqa: PLW0108
         if (module, name) == ("torch", "FloatStorage"):
             return "float32"
@@ -132,7 +134,7 @@ class _Index(pickle._Unpickler):
         """The key of a storage."""
         kind, dtype, key = pid[:3]
         if (kind, dtype) != ("storage", "float32") or not str(key).isalnum():
-            raise BadInput("its policy.pth names a storage that is none of float32.")
+            raise BadInput("its policy.pth names a storage that is not float32, allowed: float32.")
         return str(key)
 
 
@@ -140,28 +142,28 @@ def _numbers(storage: np.ndarray, tensor: _Tensor) -> np.ndarray:
     size, offset = tuple(int(length) for length in tensor.size), int(tensor.offset)
     number = math.prod(size)
     if not 1 <= len(size) <= 2 or min(size) < 1 or not 0 <= offset <= storage.size - number:
-        raise BadInput(f"its policy.pth holds a tensor of shape {size} that its storage does not.")
+        raise BadInput(f"its policy.pth holds a tensor of shape {size} that does not fit into its storage.")
     if tuple(tensor.stride) != ((size[1], 1) if len(size) == 2 else (1,)):
         raise BadInput("its policy.pth holds a tensor that is not contiguous.")
     return storage[offset : offset + number].reshape(size)
 
 
 def _unknown_kind(about: Any) -> str | None:
-    """What `data` says that this policy could not be, or None."""
+    """What in the description is not allowed, or None."""
     if not isinstance(about, dict):
         return "has a damaged description."
     policy, options = about.get("policy_class"), about.get("policy_kwargs")
     module = policy.get("__module__") if isinstance(policy, dict) else None
     if module != "stable_baselines3.common.policies" or not isinstance(options, dict):
-        return f"has a policy of its own (module {str(module)[:60]!r})."
+        return f"has a custom policy (module {str(module)[:60]!r}), allowed: the MlpPolicy of Stable-Baselines3."
     if about.get("use_sde") or options.get("use_sde") or options.get("squash_output"):
         return "explores by gSDE or squashes its output, allowed: a plain Gaussian."
     activation = str(options.get("activation_fn", "Tanh"))[:80]
     if activation not in ("Tanh", "<class 'torch.nn.modules.activation.Tanh'>"):
         return f"has the activation {activation}, allowed: tanh."
-    own = set(options) - HARMLESS - {":type:", ":serialized:", "use_sde", "squash_output"}
-    if own:
-        return f"was made with policy_kwargs {str(sorted(own))[:120]}, allowed: net_arch."
+    custom = set(options) - HARMLESS - {":type:", ":serialized:", "use_sde", "squash_output"}
+    if custom:
+        return f"was made with policy_kwargs {str(sorted(custom))[:120]}, allowed: net_arch."
     for name, shape in (("observation_space", [SIZE]), ("action_space", [4])):
         space = about.get(name)
         found = space.get("_shape") if isinstance(space, dict) else None
@@ -174,7 +176,7 @@ def _unknown_kind(about: Any) -> str | None:
 
 
 def actor_network(tensors: dict[str, np.ndarray]) -> Network:
-    """The actor among the tensors of an MlpPolicy, by the names its `state_dict` gives them."""
+    """The actor of an MlpPolicy, from its tensors by the names in its `state_dict`."""
     layers = _layers(tensors)
     return Network(
         weights=tuple(jnp.asarray(tensors[f"{layer}.weight"].T) for layer in layers),
@@ -189,7 +191,7 @@ def _layers(tensors: dict[str, np.ndarray]) -> list[str]:
 
 
 def _unknown_shape(tensors: dict[str, np.ndarray]) -> str | None:
-    """What in the tensors is not the actor of an MlpPolicy, or None."""
+    """What in the tensors does not belong to the actor of an MlpPolicy, or None."""
     critic = ("mlp_extractor.value_net.", "value_net.")
     names, layers = {name for name in tensors if not name.startswith(critic)}, _layers(tensors)
     if names != {"log_std", *(f"{layer}.{part}" for layer in layers for part in ("weight", "bias"))}:
