@@ -1,14 +1,17 @@
 # make demo    train the baseline controller, fly 100 trials, write report.html
 # make test    the test suite        make test-slow   the trainings it leaves out
 # make test-sb3  the tests that need PyTorch (a large download)
+# make test-busy  the test suite while every core is kept busy: no test may depend on the speed of the machine
 # make docs    the documentation as a site, build/docs
 # make check   lint, types, layers   make pins        renew the pinned requirements
 PYTHON ?= python3
 BIN := .venv/bin
 WORKERS ?= 2
+# a file's tests share compiled programs, so one worker runs all of them
+PYTEST := $(BIN)/python -m pytest -n $(WORKERS) --dist loadfile
 export PIP_DISABLE_PIP_VERSION_CHECK = 1
 
-.PHONY: demo test test-slow test-sb3 check docs pins clean
+.PHONY: demo test test-busy test-slow test-sb3 check docs pins clean
 
 demo: .venv/base.stamp
 	@run=$$($(BIN)/flytune train baseline | tail -n 1) && \
@@ -16,15 +19,22 @@ demo: .venv/base.stamp
 	echo "open report.html in a browser"
 
 test: .venv/dev.stamp
-	$(BIN)/python -m pytest -m "not slow" -n $(WORKERS)
+	$(PYTEST) -m "not slow"
+
+# the loops are ended also where the tests fail or are interrupted; a loop whose shell was killed ends itself
+BUSY := import os; shell = os.getppid()\nwhile os.getppid() == shell: sum(range(100_000))
+test-busy: .venv/dev.stamp
+	@for core in $$(seq $(WORKERS)); do printf '$(BUSY)\n' | $(BIN)/python - & loops="$$loops $$!"; done; \
+	trap 'kill $$loops' EXIT; trap 'exit 130' INT TERM; \
+	$(PYTEST) -m "not slow"
 
 test-slow: .venv/dev.stamp
-	$(BIN)/python -m pytest -m slow -n $(WORKERS)
+	$(PYTEST) -m slow
 
 # TORCH says what to install where torch is missing; set PIP_INDEX_URL or PIP_FIND_LINKS to take its smaller CPU build
 TORCH ?= torch==2.13.0
 test-sb3: .venv/sb3.stamp
-	$(BIN)/python -m pytest tests/sb3 -n $(WORKERS)
+	$(PYTEST) tests/sb3
 
 check: .venv/dev.stamp
 	$(BIN)/ruff check .
@@ -62,4 +72,4 @@ pins:
 		sha256sum "$$file" | sed -E 's/ .*//; s/^/    --hash=sha256:/'; done > ../../requirements/sb3.txt
 
 clean:
-	rm -rf .venv .jax_cache runs report.html
+	rm -rf .venv .jax_cache build runs report.html

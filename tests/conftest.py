@@ -1,8 +1,11 @@
 """What every test shares: a single-threaded XLA, a compilation cache, and types that are checked while tests run."""
 
+import ctypes
+import gc
 import os
 import shutil
 import sys
+from importlib import import_module
 from pathlib import Path
 from types import ModuleType
 from typing import Self
@@ -19,17 +22,38 @@ from jaxtyping import install_import_hook
 from tests.chromium import BROWSERS, ON_A_MAC, Browser
 
 # A float may be an int, and in compiled code it is a tracer. Beartype knows no Self outside of a class that it decorates.
-CHECKED = BeartypeConf(hint_overrides=FrozenDict({float: float | int | jax.Array, Self: object}))
+RULES = BeartypeConf(hint_overrides=FrozenDict({float: float | int | jax.Array, Self: object}))
 
 
-def check_functions(function):
-    """Beartype on a function, but not on a constructor: JAX rebuilds our dataclasses with tracers in their numbers."""
-    return function if function.__name__ == "__init__" else beartype(function, conf=CHECKED)
+def check_types(function):
+    """The function with its types and shapes checked at each call.
+
+    Two kinds are left out: constructors, since JAX rebuilds our dataclasses with tracers in their numbers; and the
+    arguments of what a user calls from Python, since these functions refuse a bad argument in their own words.
+    """
+    if function.__name__ == "__init__":
+        return function
+    if function.__qualname__ in import_module("flytune").__all__:
+        hints = function.__annotations__
+        function.__annotations__ = {"return": hints["return"]} if "return" in hints else {}
+    return beartype(function, conf=RULES)
 
 
 sys.modules["flytune_type_checker"] = checker = ModuleType("flytune_type_checker")
-checker.check_functions = check_functions
-install_import_hook("flytune", "flytune_type_checker.check_functions")
+checker.check_types = check_types
+CHECKED = "config, control, errors, evaluation.judge, evaluation.metrics, export, extras, physics, runs, simulation.environment, task"
+install_import_hook([f"flytune.{room}" for room in CHECKED.split(", ")], "flytune_type_checker.check_types")
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _compiled_programs_are_freed():
+    """Frees the programs that a file's tests compiled: each takes some 5 to 10 MB, and JAX keeps all of them."""
+    yield
+    jax.clear_caches()
+    gc.collect()
+    trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
+    if trim:  # the C library of most Linux systems keeps what was freed until it is told to give it back
+        trim(0)
 
 
 @pytest.fixture

@@ -173,9 +173,7 @@ def test_weights_in_another_file_are_found_in_constants_subgraphs_functions_and_
 
 def test_operators_of_other_makers_loops_randomness_and_functions_are_refused():
     own = helper.make_node("Tanh", ["raw"], ["action"], domain="com.microsoft")
-    assert_refused(
-        make_model((*LAYERS[:3], own), opsets=("", "com.microsoft")), "'com.microsoft::Tanh' is not allowed"
-    )
+    assert_refused(make_model((*LAYERS[:3], own), opsets=("", "com.microsoft")), "'com.microsoft::Tanh' is not allowed")
     noise = helper.make_node("RandomNormalLike", ["raw"], ["more"])
     assert_refused(make_model(squashed(noise)), "'RandomNormalLike' is not allowed")
     body = helper.make_graph(
@@ -196,7 +194,9 @@ def test_a_small_file_that_would_need_all_memory_is_refused():
     back = helper.make_node("Slice", ["x40", "zero", "four", "one"], ["more"])
     start = helper.make_node("Identity", ["raw"], ["x0"])
     ends = {name: np.array([number]) for name, number in (("zero", 0), ("four", 4), ("one", 1))}
-    assert_refused(make_model(squashed(start, *doubled, back), **ends), "numbers per observation. Allowed: up to 1000000")
+    assert_refused(
+        make_model(squashed(start, *doubled, back), **ends), "numbers per observation. Allowed: up to 1000000"
+    )
 
 
 # --- other inputs, outputs, conventions ---
@@ -301,8 +301,10 @@ def test_a_file_damaged_anywhere_is_refused_in_one_line_or_gives_finite_actions(
     try:
         controller = read_onnx(bytes(content[:cut]), "p.onnx")
     except BadInput as refused:
-        assert str(refused).startswith("p.onnx: ") and len(str(refused).splitlines()) == 1
+        lines = str(refused).splitlines()
     else:
+        lines = []
         assert all(isinstance(text, str) for text in controller.about.values())
         actions = controller.session(sample_observations(20))
         assert actions.shape == (20, 4) and np.all(np.isfinite(actions))
+    assert [line.startswith("p.onnx: ") for line in lines] in ([], [True])

@@ -21,7 +21,7 @@ from flytune.export.untrusted.onnx_session import CONVENTIONS, FORMAT, INPUT, OU
 from flytune.extras import require
 from flytune.task.observation import SIZE
 
-__all__ = ["CONVENTIONS", "OnnxController", "load_onnx", "rounding_bound", "save_onnx"]
+__all__ = ["CONVENTIONS", "OnnxController", "check_actions", "load_onnx", "rounding_bound", "save_onnx"]
 
 # From December 2020: onnxruntime 1.6 and every later version read it, and no operator of the graph has changed since.
 OPERATOR_SET, INTERMEDIATE_REPRESENTATION = 13, 7
@@ -38,7 +38,7 @@ def save_onnx(path: Path, policy: Policy) -> None:
             earlier file at this path is then untouched.
     """
     content = _model(policy).SerializeToString()
-    _check(read_onnx(content, str(path)), policy, path)
+    check_actions(read_onnx(content, str(path)), policy, str(path))
     write_bytes(path, content)
 
 
@@ -68,14 +68,19 @@ def rounding_bound(policy: Policy, observations: Float[np.ndarray, "batch 17"]) 
     return error
 
 
-def _check(controller: OnnxController, policy: Policy, path: Path) -> None:
+def check_actions(controller: OnnxController, policy: Policy, where: str) -> None:
+    """Refuse an ONNX file whose actions differ from those of the policy by more than the rounding of float32.
+
+    Raises:
+        BadInput: an action differs; the message begins with `where`, the name of the file.
+    """
     observations = sample_observations(CHECKED)
     difference = np.abs(controller.session(observations) - np.asarray(jax.jit(policy.__call__)(observations)))
     allowed = 2 * rounding_bound(policy, observations)  # each of the two actions may have this error
     if not np.all(difference <= allowed):
         row, motor = np.unravel_index(np.argmax(difference - allowed), difference.shape)
         raise BadInput(
-            f"{path}: for sample observation {row}, the action of onnxruntime differs from that of the policy by "
+            f"{where}: for sample observation {row}, the action of onnxruntime differs from that of the policy by "
             f"{difference[row, motor]:.2g} at motor {motor}. Allowed: {allowed[row, motor]:.2g}, the rounding of "
             "float32. Nothing was written; try another version of onnxruntime."
         )

@@ -71,7 +71,9 @@ def load_onnx(path: Path) -> OnnxController:
     except OSError as error:
         raise BadInput(f"{path}: cannot be read ({error.strerror}). Give an .onnx policy.") from None
     if len(content) > LARGEST:
-        raise BadInput(f"{path}: is larger than {LARGEST // 10**6} MB. Allowed: a policy of up to that size; give a smaller network.")
+        raise BadInput(
+            f"{path}: is larger than {LARGEST // 10**6} MB. Allowed: a policy of up to that size; give a smaller network."
+        )
     return read_onnx(content, str(path))
 
 
@@ -94,7 +96,9 @@ def _probe(session: Session, where: str) -> None:
     observations = sample_observations(PROBES)
     actions = session(observations)
     if actions.shape != (PROBES, 4):
-        raise BadInput(f"{where}: gives actions of shape {actions.shape} for {PROBES} observations. Allowed: ({PROBES}, 4).")
+        raise BadInput(
+            f"{where}: gives actions of shape {actions.shape} for {PROBES} observations. Allowed: ({PROBES}, 4)."
+        )
     if not np.all(np.isfinite(actions)):
         raise BadInput(f"{where}: gives an action that is not finite for a finite observation. Train it again.")
     if (largest := np.abs(actions).max()) > 1 + BEYOND_BOX:

@@ -133,7 +133,9 @@ def _refuse_wide_nodes(inferred: Any, where: str) -> None:
     for value in inferred.graph.value_info:
         width = math.prod(size.dim_value or 1 for size in value.type.tensor_type.shape.dim)
         if width > WIDEST:
-            raise BadInput(f"{where}: node {_shown(value.name)} computes {width} numbers per observation. Allowed: up to {WIDEST}.")
+            raise BadInput(
+                f"{where}: node {_shown(value.name)} computes {width} numbers per observation. Allowed: up to {WIDEST}."
+            )
 
 
 def _refuse_other_conventions(model: Any, where: str) -> None:
@@ -153,7 +155,9 @@ def _refuse_broken_numbers(onnx: Any, model: Any, where: str) -> None:
     allowed = {getattr(onnx.TensorProto, name) for name in NUMBERS}
     for tensor in _tensors(onnx, model):
         if tensor.data_type not in allowed:
-            raise BadInput(f"{where}: tensor {_shown(tensor.name)} has a type that is not allowed. Allowed: {', '.join(NUMBERS)}.")
+            raise BadInput(
+                f"{where}: tensor {_shown(tensor.name)} has a type that is not allowed. Allowed: {', '.join(NUMBERS)}."
+            )
         try:
             values = onnx.numpy_helper.to_array(tensor)
         except Exception as error:  # its size does not match its shape
