@@ -79,7 +79,7 @@ def fly_one(folder: Path, updates: int, job: tuple[str | None, float | None, int
     row = {"seed": seed, "settled": 0, "settling_time": None, "overshoot": None, "error": None}
     try:
         told = judge(
-            fly(train(task, seed=seed, initial=initial).policy, task, trials=TRIALS, seed=SEED, duration=DURATION)
+            fly(train(task, seed=seed, warm_start=initial).policy, task, trials=TRIALS, seed=SEED, duration=DURATION)
         ).to_dict()
         position, axes = told["position"], told["axes"]
         row |= {

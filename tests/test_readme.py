@@ -44,7 +44,7 @@ def test_the_names_the_readme_lists_are_the_ones_that_ship():
     from flytune.control.classical import CLASSICAL
     from flytune.physics.vehicle import vehicle_names
     from flytune.task.task import preset_names
-    from flytune.training.loop import TRAINERS
+    from flytune.training.trainer import TRAINERS
 
     extras = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]["optional-dependencies"]
     first_cells = re.findall(r"^\| (`[^|]+`)", README, flags=re.MULTILINE)

@@ -12,6 +12,7 @@ import pytest
 from flytune.errors import BadInput, Interrupted
 from flytune.reproduction.study import Study, condition, open_study
 from flytune.reproduction.trainings import train_all
+from flytune.runs.directory import CHECKPOINT
 
 STEPS = 3 * 16_384  # three updates
 
@@ -118,7 +119,7 @@ def test_a_training_that_never_came_to_a_checkpoint_begins_again(done, tmp_path)
     facts = json.loads((member.directory / "run.json").read_text())
     (member.directory / "run.json").write_text(json.dumps({**facts, "finished": False}))
     assert condition(study, member, quietly) == "begun"
-    (member.directory / "checkpoint" / "learner.safetensors").unlink()
+    (member.directory / CHECKPOINT).unlink()
     assert condition(study, member, quietly) == "new"
     assert not member.directory.exists()
 
@@ -161,7 +162,7 @@ def test_a_folder_that_is_something_else_is_refused(tmp_path, make, word):
 
 @pytest.mark.parametrize(
     ("changes", "word"),
-    [({"trainer": "sb3"}, "Allowed: ppo, apg"), ({"seeds": 0}, "1 to 100"), ({"steps": 0}, "1 or more")],
+    [({"trainer": "sb3"}, "Allowed: apg, ppo"), ({"seeds": 0}, "1 to 100"), ({"steps": 0}, "1 or more")],
 )
 def test_a_study_nobody_can_make_is_refused(changes, word):
     with pytest.raises(BadInput, match=word):

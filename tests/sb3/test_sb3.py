@@ -19,9 +19,10 @@ from flytune.errors import BadInput, Diverged
 from flytune.export.untrusted.sb3_model import actor_network
 from flytune.runs.directory import RunDirectory
 from flytune.task.task import load_task, write_task
-from flytune.task.termination import causes
 from flytune.training import sb3
-from flytune.training.loop import _row, total_updates, train, with_steps
+from flytune.training.loop import train
+from flytune.training.rollout_metrics import metrics_row
+from flytune.training.trainer import find_trainer
 
 SMALL = {
     "ppo.environments": 4,
@@ -87,7 +88,7 @@ def test_an_interrupted_run_goes_on_to_the_same_result_bit_by_bit(task, whole, t
     train_state, rows = sb3.start(task, task.ppo, jax.random.key(1)), []
     for number in range(1, done + 1):
         train_state, seen = sb3.update(task, task.ppo, train_state)
-        rows.append(_row(seen, causes(task.termination), number, 64 * number, 0.0))
+        rows.append(metrics_row(task, seen, number, 64 * number, 0.0))
     directory.checkpoint(train_state, rows)
     del train_state
     torch.manual_seed(99), np.random.seed(99)  # noqa: NPY002  # another process begins with other random numbers
@@ -124,7 +125,7 @@ def test_the_random_numbers_of_the_process_are_left_as_they_were(task):
     wanted = float(torch.rand(())), np.random.random()  # noqa: NPY002
     torch.manual_seed(3), np.random.seed(3)  # noqa: NPY002
     torch.set_num_threads(2)
-    train(with_steps(task, "sb3", 64), "sb3")
+    train(find_trainer("sb3").with_steps(task, 64), "sb3")
     assert (float(torch.rand(())), np.random.random()) == wanted  # noqa: NPY002
     assert torch.get_num_threads() == 2
     torch.set_num_threads(1)
@@ -139,7 +140,7 @@ def test_numbers_that_stop_being_finite_end_the_training_with_what_and_when(task
 
 
 def test_steps_are_those_of_ppo(task):
-    assert total_updates(with_steps(task, "sb3", 100), "sb3") == 2
+    assert find_trainer("sb3").with_steps(task, 100).ppo.updates == 2
 
 
 @pytest.mark.parametrize("package", ["stable_baselines3", "torch", "gymnasium"])
@@ -161,9 +162,9 @@ def test_a_missing_package_is_named_with_its_remedy_before_anything_is_written(t
 
 
 def test_a_resumed_run_of_another_trainer_is_refused(task, tmp_path):
-    train(with_steps(task, "sb3", 64), "sb3", out=tmp_path / "run")
+    train(find_trainer("sb3").with_steps(task, 64), "sb3", out=tmp_path / "run")
     with pytest.raises(BadInput, match="sb3"):
-        train(with_steps(task, "ppo", 64), "ppo", out=tmp_path / "run", resume=True)
+        train(find_trainer("ppo").with_steps(task, 64), "ppo", out=tmp_path / "run", resume=True)
 
 
 @pytest.mark.parametrize(

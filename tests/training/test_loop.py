@@ -9,11 +9,13 @@ import pytest
 
 from flytune.control.policy import load_policy
 from flytune.errors import BadInput, Diverged
+from flytune.runs.directory import CHECKPOINT, RunDirectory
 from flytune.task.task import load_task, write_task
-from flytune.training.loop import TRAINERS as TEACHERS
-from flytune.training.loop import total_updates, train, with_steps
+from flytune.training.loop import train
+from flytune.training.rollout_metrics import metrics_row
+from flytune.training.trainer import TRAINERS, find_trainer, trainer_names
 
-TRAINERS = ["apg", "ppo"]
+OWN = trainer_names(every_task=True)  # without Stable-Baselines3, which has its own tests
 
 
 def weights(policy):
@@ -25,7 +27,7 @@ def assert_identical(first, second):
         np.testing.assert_array_equal(one, other)
 
 
-@pytest.mark.parametrize("trainer", TRAINERS)
+@pytest.mark.parametrize("trainer", OWN)
 def test_a_run_directory_holds_all_that_the_contract_names(small_task, tmp_path, trainer):
     run = train(small_task, trainer, seed=3, out=tmp_path / "run")
     names = {path.name for path in (tmp_path / "run").iterdir()}
@@ -42,14 +44,14 @@ def test_a_run_directory_holds_all_that_the_contract_names(small_task, tmp_path,
     assert facts["finished"] and facts["seed"] == 3 and facts["trainer"] == trainer and facts["steps"] > 0
     assert {"flytune", "jax", "python"} <= set(facts["versions"])
     rows = [json.loads(line) for line in (tmp_path / "run" / "metrics.jsonl").read_text().splitlines()]
-    assert [row["update"] for row in rows] == list(range(1, total_updates(small_task, trainer) + 1))
+    assert [row["update"] for row in rows] == list(range(1, getattr(small_task, trainer).updates + 1))
     assert set(rows[0]["terms"]) == set(small_task.reward)
     assert set(rows[0]["terminations"]) == {*small_task.termination, "diverged"}
     assert_identical(load_policy(tmp_path / "run" / "policy.safetensors"), run.policy)
     assert_identical(load_policy(tmp_path / "run" / "policy-last.safetensors"), run.last_policy)
 
 
-@pytest.mark.parametrize("trainer", TRAINERS)
+@pytest.mark.parametrize("trainer", OWN)
 def test_the_same_seed_gives_the_same_policy_bit_by_bit_and_another_seed_another(small_task, trainer):
     first, again, other = (train(small_task, trainer, seed=seed) for seed in (1, 1, 2))
     assert_identical(first.policy, again.policy)
@@ -57,19 +59,16 @@ def test_the_same_seed_gives_the_same_policy_bit_by_bit_and_another_seed_another
     assert any((a != b).any() for a, b in zip(weights(first.policy), weights(other.policy), strict=True))
 
 
-@pytest.mark.parametrize("trainer", TRAINERS)
+@pytest.mark.parametrize("trainer", OWN)
 def test_an_interrupted_run_goes_on_to_the_same_result_bit_by_bit(small_task, tmp_path, trainer):
-    from flytune.runs.directory import RunDirectory
-    from flytune.training import loop as module
-
     whole = train(small_task, trainer, seed=1)
     # the state after two updates, as an interruption would have left it
     directory = RunDirectory(tmp_path / "run", small_task, trainer, 1, resume=False)
-    settings, teacher = getattr(small_task, trainer), module.TRAINERS[trainer]
-    train_state, rows = teacher.start(small_task, settings, jax.random.key(1)), []
+    method = find_trainer(trainer)
+    train_state, rows = method.start(small_task, jax.random.key(1)), []
     for number in (1, 2):
-        train_state, seen = teacher.update(small_task, settings, train_state)
-        rows.append(module._row(seen, [*sorted(small_task.termination), "diverged"], number, number, 0.0))
+        train_state, measured = method.update(small_task, train_state)
+        rows.append(metrics_row(small_task, measured, number, number, 0.0))
     directory.checkpoint(train_state, rows)
     resumed = train(small_task, trainer, seed=1, out=tmp_path / "run", resume=True)
     assert_identical(whole.policy, resumed.policy)
@@ -101,12 +100,19 @@ def test_a_directory_that_holds_a_run_is_refused_and_kept(small_task, tmp_path):
 
 def test_a_damaged_checkpoint_is_named(small_task, tmp_path):
     train(small_task, "apg", out=tmp_path / "run")
-    (tmp_path / "run" / "checkpoint" / "learner.safetensors").write_bytes(b"not a checkpoint")
-    with pytest.raises(BadInput, match=r"learner\.safetensors is damaged"):
+    (tmp_path / "run" / CHECKPOINT).write_bytes(b"not a checkpoint")
+    with pytest.raises(BadInput, match=r"train_state\.safetensors is damaged"):
         train(small_task, "apg", out=tmp_path / "run", resume=True)
 
 
-@pytest.mark.parametrize("trainer", TRAINERS)
+def test_a_checkpoint_of_an_older_version_is_refused_in_one_line(small_task, tmp_path):
+    train(small_task, "apg", out=tmp_path / "run")
+    (tmp_path / "run" / CHECKPOINT).rename(tmp_path / "run" / "checkpoint" / "learner.safetensors")
+    with pytest.raises(BadInput, match=r"^resume: .*older version of flytune \(learner\.safetensors\).*[^\n]*$"):
+        train(small_task, "apg", out=tmp_path / "run", resume=True)
+
+
+@pytest.mark.parametrize("trainer", OWN)
 def test_numbers_that_stop_being_finite_end_the_training_with_what_and_when(small_task, trainer):
     settings = dataclasses.replace(getattr(small_task, trainer), learning_rate=1e38)
     with pytest.raises(Diverged, match=r"is (nan|inf|-inf) in update \d+ \(\d+ environment steps\)"):
@@ -115,25 +121,25 @@ def test_numbers_that_stop_being_finite_end_the_training_with_what_and_when(smal
 
 def test_steps_are_rounded_up_to_whole_updates(small_task):
     # apg: 4 environments x 10 steps = 40 per update; 100 steps need 3 updates
-    assert total_updates(with_steps(small_task, "apg", 100), "apg") == 3
+    assert find_trainer("apg").with_steps(small_task, 100).apg.updates == 3
     # ppo: 4 x 16 = 64 per update; 100 steps need 2 updates
-    assert total_updates(with_steps(small_task, "ppo", 100), "ppo") == 2
+    assert find_trainer("ppo").with_steps(small_task, 100).ppo.updates == 2
     with pytest.raises(BadInput, match="steps: 0"):
-        with_steps(small_task, "apg", 0)
+        find_trainer("apg").with_steps(small_task, 0)
 
 
 def test_unknown_trainers_and_impossible_seeds_are_refused(small_task):
-    with pytest.raises(BadInput, match="apg, ppo"):
+    with pytest.raises(BadInput, match=f"Allowed: {', '.join(TRAINERS)}"):
         train(small_task, "sarsa")
     with pytest.raises(BadInput, match="seed"):
         train(small_task, "apg", seed=-1)
 
 
-@pytest.mark.parametrize("trainer", TRAINERS)
-def test_an_update_gives_back_a_learner_of_the_types_it_took_so_that_it_compiles_only_once(small_task, trainer):
-    teacher, settings = TEACHERS[trainer], getattr(small_task, trainer)
-    before = jax.eval_shape(lambda key: teacher.start(small_task, settings, key), jax.random.key(0))
-    after, _ = jax.eval_shape(lambda train_state: teacher.update(small_task, settings, train_state), before)
+@pytest.mark.parametrize("trainer", OWN)
+def test_an_update_gives_a_state_of_the_types_it_took_so_that_it_compiles_only_once(small_task, trainer):
+    method = find_trainer(trainer)
+    before = jax.eval_shape(lambda key: method.start(small_task, key), jax.random.key(0))
+    after, _ = jax.eval_shape(lambda train_state: method.update(small_task, train_state), before)
     kinds = [
         [(leaf.shape, leaf.dtype, leaf.weak_type) for leaf in jax.tree.leaves(train_state)]
         for train_state in (before, after)

@@ -15,8 +15,7 @@ from flytune.simulation import environment
 from flytune.task.observation import NOISY
 from flytune.task.task import Task, load_task
 from flytune.task.training_settings import PpoSettings
-from flytune.training import apg, ppo
-from flytune.training.loop import steps_per_update
+from flytune.training.trainer import TRAINERS, Trainer
 
 BATCH, WIDTH = 128, 64  # of the matrix product everything is compared with: 128 x 64 times 64 x 64, float32
 SIMULATED = 1024, 200  # environments and steps of a compiled simulation
@@ -72,14 +71,14 @@ def bench(what: str = "all") -> Throughput:
     task = load_task("baseline")
     training, simulation = what in ("all", "train"), what in ("all", "simulate")
     product = _matrix_product()
-    ppo_update, fly = _training(ppo, task, task.ppo), _simulation(task)
-    ppo_rate = steps_per_update(task, "ppo") / _fastest(ppo_update) if training else None
+    ppo_update, fly = _training(TRAINERS["ppo"], task), _simulation(task)
+    ppo_rate = task.ppo.steps_per_update / _fastest(ppo_update) if training else None
     product = max(product, _matrix_product())  # the limit is what the machine can do undisturbed
     return Throughput(
         matrix_product=product,
         ppo=ppo_rate,
         ppo_share_of_limit=ppo_rate * operations_per_step(task.ppo) / product if ppo_rate else None,
-        apg=steps_per_update(task, "apg") / _fastest(_training(apg, task, task.apg)) if training else None,
+        apg=task.apg.steps_per_update / _fastest(_training(TRAINERS["apg"], task)) if training else None,
         simulate=SIMULATED[0] * SIMULATED[1] / _fastest(fly) if simulation else None,
         training=compare_training(task, ppo_update) if training else None,
         simulation=compare_simulation(task, fly, SIMULATED) if simulation else None,
@@ -122,14 +121,14 @@ def _matrix_product() -> float:
     return 2.0 * BATCH * WIDTH * WIDTH * number / _fastest(lambda: jax.block_until_ready(chain(first)))
 
 
-def _training(teacher: Any, task: Task, settings: Any) -> Callable[[], Any]:
-    """One update of a trainer, each going on from the one before."""
+def _training(trainer: Trainer, task: Task) -> Callable[[], Any]:
+    """A function that makes one update of a training, and the next one at the next call."""
     train_state = None
 
     def one() -> Any:
         nonlocal train_state
-        train_state = teacher.start(task, settings, jax.random.key(0)) if train_state is None else train_state
-        train_state, seen = teacher.update(task, settings, train_state)
+        train_state = trainer.start(task, jax.random.key(0)) if train_state is None else train_state
+        train_state, seen = trainer.update(task, train_state)
         return jax.block_until_ready(seen)
 
     return one

@@ -4,12 +4,13 @@ import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from cyclopts import Parameter, Token
 
 from flytune.config.files import check_file
 from flytune.errors import BadInput
+from flytune.training.trainer import trainer_names
 
 TASK_HELP = "a preset (baseline, acrobatic, inspection, or one of them with -refined), or a TOML file"
 CONTROLLER_HELP = (
@@ -33,6 +34,12 @@ def real_number(kind: type, tokens: Sequence[Token]) -> float:
     except ValueError:
         raise ValueError("a number") from None
 
+
+if TYPE_CHECKING:  # a type checker cannot read a list that is made at run time
+    TrainerName = EveryTaskTrainerName = str
+else:
+    TrainerName = Literal[trainer_names()]
+    EveryTaskTrainerName = Literal[trainer_names(every_task=True)]
 
 Task = Annotated[str, Parameter(name="TASK", help=TASK_HELP)]
 Controller = Annotated[str, Parameter(name="CONTROLLER", help=CONTROLLER_HELP)]

@@ -3,11 +3,11 @@
 import json
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 from cyclopts import Parameter
 
-from flytune.cli.options import AsJson, Flag, Folder, Whole
+from flytune.cli.options import AsJson, EveryTaskTrainerName, Flag, Folder, Whole
 
 
 @Parameter(name="*")
@@ -15,7 +15,7 @@ from flytune.cli.options import AsJson, Flag, Folder, Whole
 class ReproduceOptions:
     """How the paper is reproduced."""
 
-    trainer: Annotated[Literal["ppo", "apg"], Parameter(help="how to learn; the paper used ppo")] = "ppo"
+    trainer: Annotated[EveryTaskTrainerName, Parameter(help="how to learn; the paper used ppo")] = "ppo"
     seeds: Annotated[Whole, Parameter(help="number of trainings of each behaviour")] = 5
     steps: Annotated[
         Whole | None, Parameter(help="number of environment steps of each training (default: the task's own)")

@@ -1,12 +1,13 @@
 """`flytune train`."""
 
 from dataclasses import dataclass
-from typing import Annotated, Literal
+from typing import Annotated
 
 from cyclopts import Parameter
 
-from flytune.cli.options import Edits, Flag, Folder, Steps, Task, Whole, assignments
+from flytune.cli.options import Edits, Flag, Folder, Steps, Task, TrainerName, Whole, assignments
 from flytune.errors import BadInput
+from flytune.training.trainer import DEFAULT_TRAINER, TRAINERS, find_trainer
 
 
 @Parameter(name="*")
@@ -15,9 +16,9 @@ class TrainOptions:
     """How a policy is trained."""
 
     trainer: Annotated[
-        Literal["apg", "ppo", "sb3"],
-        Parameter(help="how to learn: analytic policy gradient, PPO, or the PPO of Stable-Baselines3"),
-    ] = "apg"
+        TrainerName,
+        Parameter(help="how to learn: " + "; ".join(f"{each.name}: {each.summary}" for each in TRAINERS.values())),
+    ] = DEFAULT_TRAINER
     seed: Annotated[Whole, Parameter(help="seed of the weights, the episodes and the noise")] = 0
     steps: Steps = None
     out: Annotated[Folder, Parameter(help="run directory (default: a new one under runs/)")] = None
@@ -33,12 +34,12 @@ def train(task: Task, /, *, options: TrainOptions = TrainOptions()) -> None:
     from flytune.evaluation.evaluate import evaluate, write_evaluation
     from flytune.runs.directory import new_directory
     from flytune.task.task import load_task
-    from flytune.training.loop import train, with_steps
+    from flytune.training.loop import train
     from flytune.training.progress import show_progress
 
     wanted = load_task(task, assignments(options.edits))
     if options.steps is not None:
-        wanted = with_steps(wanted, options.trainer, options.steps)
+        wanted = find_trainer(options.trainer).with_steps(wanted, options.steps)
     if options.resume and options.out is None:
         raise BadInput("resume: needs --out DIR, the run to continue.")
     out = options.out or new_directory(wanted, options.trainer, options.seed)

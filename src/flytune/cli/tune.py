@@ -6,8 +6,9 @@ from typing import Annotated, Literal
 
 from cyclopts import Parameter
 
-from flytune.cli.options import Edits, Flag, Folder, Real, Whole, assignments
+from flytune.cli.options import Edits, EveryTaskTrainerName, Flag, Folder, Real, Whole, assignments
 from flytune.errors import BadInput, Unmet
+from flytune.training.trainer import DEFAULT_TRAINER, trainer_names
 
 
 @Parameter(name="*")
@@ -40,9 +41,12 @@ class TuneOptions:
         Parameter(metavar="FILE.toml", help="your own rules, beside those that `flytune rules` prints"),
     ] = None
     trainer: Annotated[
-        Literal["apg", "ppo"],
-        Parameter(help="how to learn: apg continues from the last policy, ppo starts from new weights"),
-    ] = "apg"
+        EveryTaskTrainerName,
+        Parameter(
+            help=f"how to learn: {' and '.join(trainer_names(warm_start=True))} continues from the last policy, "
+            "the others start from new weights"
+        ),
+    ] = DEFAULT_TRAINER
     steps: Annotated[Whole, Parameter(help="largest number of edits")] = 12
     seed: Annotated[Whole, Parameter(help="seed of the trainings")] = 0
     out: Annotated[Folder, Parameter(help="run directory (default: a new one under runs/)")] = None

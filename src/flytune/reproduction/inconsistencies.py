@@ -13,6 +13,7 @@ from flytune.reproduction.evidence import Evidence
 from flytune.reproduction.standstill import standstill_distance
 from flytune.reproduction.study import ROLES
 from flytune.reproduction.verdict import Measure, share
+from flytune.training.trainer import find_trainer
 
 DISCOUNTS = (0.99, 0.995, 0.997, 0.998, 0.999)
 MOVED = 0.1  # share of the horizontal distance; a trial that covers less stood still
@@ -53,7 +54,7 @@ def _standing_still(evidence: Evidence) -> Point:
             measures.append(Measure(what=what + ("" if distance else " (never, up to 3 m)"), value=distance, unit="m"))
     task = evidence.tasks["inspection"]
     limit = standstill_distance(task, float(task.ppo.discount))
-    if limit is not None and evidence.study.trainer == "ppo":
+    if limit is not None and hasattr(find_trainer(evidence.study.trainer).settings(task), "discount"):
         for flown in ("last", "average"):
             seat = evidence.seat("inspection", flown)
             stood = [p[d > limit] < MOVED for p, d in zip(seat.progress, seat.distance, strict=True)]

@@ -11,9 +11,9 @@ from flytune.config import document
 from flytune.config.files import make_folder, write_json
 from flytune.control.policy import load_policy
 from flytune.errors import BadInput
-from flytune.runs.directory import first_difference, read_facts
+from flytune.runs.directory import first_difference, has_checkpoint, read_facts
 from flytune.task.task import Task, load_task
-from flytune.training.loop import with_steps
+from flytune.training.trainer import find_trainer
 
 ROLES = ("baseline", "acrobatic", "inspection")
 CONDITION = Literal["new", "begun", "done"]
@@ -41,8 +41,7 @@ class Study:
     refined: bool = False  # the refined presets in place of the printed ones
 
     def __post_init__(self) -> None:
-        if self.trainer not in ("ppo", "apg"):
-            raise BadInput(f"trainer: {self.trainer!r} is not allowed. Allowed: ppo, apg.")
+        find_trainer(self.trainer, every_task=True)
         if not 1 <= self.seeds <= 100:
             raise BadInput(f"seeds: {self.seeds} is not allowed. Allowed: a whole number, 1 to 100.")
         for role in ROLES:
@@ -55,7 +54,7 @@ class Study:
     def task(self, role: str) -> Task:
         """What is trained and flown, with the number of steps the study asks for."""
         task = load_task(self.preset(role))
-        return task if self.steps is None else with_steps(task, self.trainer, self.steps)
+        return task if self.steps is None else find_trainer(self.trainer).with_steps(task, self.steps)
 
     def members(self) -> list[Member]:
         """Every training, seed by seed, so that each behaviour has its first policy early."""
@@ -131,7 +130,7 @@ def condition(study: Study, member: Member, tell: Callable[[str], None]) -> COND
         )
     if facts.get("finished"):
         return "done"
-    if (here / "checkpoint" / "learner.safetensors").exists():
+    if has_checkpoint(here):
         return "begun"
     shutil.rmtree(here)
     return "new"

@@ -6,6 +6,7 @@ import platform
 import subprocess
 import sys
 import time
+from collections.abc import Sequence
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -21,6 +22,8 @@ from flytune.control.policy import Policy, save_policy
 from flytune.errors import BadInput
 from flytune.task.task import Task, load_task, write_task
 
+CHECKPOINT = Path("checkpoint") / "train_state.safetensors"  # in a run directory
+
 
 def new_directory(task: Task, trainer: str, seed: int, parent: Path = Path("runs")) -> Path:
     """A directory that does not exist yet, named after the training and numbered where the name is taken."""
@@ -32,9 +35,23 @@ def new_directory(task: Task, trainer: str, seed: int, parent: Path = Path("runs
 
 
 class RunDirectory:
-    """The files of one run; what is written is whole or absent."""
+    """The files of one training; each file is whole or absent.
 
-    def __init__(self, path: Path, task: Task, trainer: str, seed: int, resume: bool) -> None:
+    Args:
+        path: the directory.
+        task: what is trained.
+        trainer: its name.
+        seed: of the training.
+        resume: continue the training in the directory, instead of making a new one.
+        packages: optional packages whose versions run.json records.
+
+    Raises:
+        BadInput: the directory holds something else, or cannot be written; nothing was changed.
+    """
+
+    def __init__(
+        self, path: Path, task: Task, trainer: str, seed: int, resume: bool, packages: Sequence[str] = ()
+    ) -> None:
         self.path = path
         if path.exists() and not path.is_dir():
             raise BadInput(f"out: {path} is a file. Give a directory that does not exist yet.")
@@ -43,10 +60,10 @@ class RunDirectory:
             self._check_same(task, trainer, seed, holds_run)
             return
         if holds_run:
-            raise BadInput(f"out: {path} already holds a run. Give another directory, or --resume to go on with it.")
+            raise BadInput(f"out: {path} already holds a run. Give another directory, or --resume to continue it.")
         make_folder(path)
         write_text(path / "task.toml", write_task(task))
-        write_json(path / "run.json", _facts(task, trainer, seed))
+        write_json(path / "run.json", _facts(task, trainer, seed, packages))
 
     def _check_same(self, task: Task, trainer: str, seed: int, holds_run: bool) -> None:
         if not holds_run:
@@ -62,20 +79,29 @@ class RunDirectory:
             raise BadInput(
                 f"resume: {self.path} was trained with another {path}. Give {self.path}/task.toml as the task."
             )
-        if not (self.path / "checkpoint" / "learner.safetensors").exists():
-            raise BadInput(f"resume: {self.path} holds no checkpoint. Train again into another directory.")
+        if has_checkpoint(self.path):
+            return
+        if (self.path / "checkpoint" / "learner.safetensors").exists():
+            raise BadInput(
+                f"resume: {self.path} holds the checkpoint of an older version of flytune (learner.safetensors), which "
+                "this version cannot continue. Train again into another directory."
+            )
+        raise BadInput(f"resume: {self.path} holds no checkpoint. Train again into another directory.")
 
     def checkpoint(self, train_state: Any, rows: list[dict[str, Any]]) -> None:
-        """Write everything that is needed to go on exactly, and the metrics up to here."""
-        folder = self.path / "checkpoint"
-        make_folder(folder)
+        """Write everything that is needed to continue exactly, and the metrics so far."""
+        make_folder(self.path / CHECKPOINT.parent)
         leaves = {f"{index:03d}": np.asarray(_raw(leaf)) for index, leaf in enumerate(jax.tree.leaves(train_state))}
-        write_bytes(folder / "learner.safetensors", safetensors.numpy.save(leaves, {"rows": json.dumps(rows)}))
+        write_bytes(self.path / CHECKPOINT, safetensors.numpy.save(leaves, {"rows": json.dumps(rows)}))
         write_text(self.path / "metrics.jsonl", "".join(json.dumps(row) + "\n" for row in rows))
 
     def resume(self, fresh: Any) -> tuple[Any, list[dict[str, Any]]]:
-        """The learner and the metrics of the checkpoint; `fresh` says what the learner is made of."""
-        path = self.path / "checkpoint" / "learner.safetensors"
+        """The training state and the metrics of the checkpoint; `fresh` is a state of the same structure.
+
+        Raises:
+            BadInput: the checkpoint is damaged, or of another version of flytune.
+        """
+        path = self.path / CHECKPOINT
         try:
             with safetensors.safe_open(path, framework="numpy") as file:
                 stored = [file.get_tensor(name) for name in sorted(file.keys())]
@@ -93,15 +119,20 @@ class RunDirectory:
         return jax.tree.unflatten(structure, restored), rows
 
     def finish(self, policy: Policy, last_policy: Policy, last: dict[str, Any]) -> None:
-        """Write the policies and say that the run is complete; `last` is the last row of the metrics."""
+        """Write the policies, and into run.json that the training is complete; `last` is the last row of the metrics."""
         save_policy(self.path / "policy.safetensors", policy)
         save_policy(self.path / "policy-last.safetensors", last_policy)
         finished = {"finished": True, "steps": last["steps"], "seconds": last["seconds"]}
         write_json(self.path / "run.json", read_facts(self.path) | finished)
 
 
+def has_checkpoint(directory: Path) -> bool:
+    """Whether a directory holds the checkpoint of a training."""
+    return (directory / CHECKPOINT).exists()
+
+
 def resume_command(path: Path, trainer: str, seed: int) -> str:
-    """What to type to go on with an interrupted run."""
+    """The command that continues an interrupted training."""
     return f"flytune train {path / 'task.toml'} --trainer {trainer} --seed {seed} --out {path} --resume"
 
 
@@ -125,9 +156,8 @@ def read_facts(directory: Path) -> dict[str, Any]:
     return facts
 
 
-def _facts(task: Task, trainer: str, seed: int) -> dict[str, Any]:
-    packages = ["flytune", "jax", "jaxlib", "numpy", "optax"]
-    packages += ["stable_baselines3", "torch"] if trainer == "sb3" else []
+def _facts(task: Task, trainer: str, seed: int, optional: Sequence[str]) -> dict[str, Any]:
+    packages = ["flytune", "jax", "jaxlib", "numpy", "optax", *optional]
     return {
         "task": task.name,
         "trainer": trainer,

@@ -14,7 +14,7 @@ from flytune.control.policy import load_policy
 from flytune.errors import BadInput
 from flytune.export.untrusted.onnx_controller import load_onnx
 from flytune.export.untrusted.sb3_model import load_sb3
-from flytune.runs.directory import read_facts, resume_command
+from flytune.runs.directory import has_checkpoint, read_facts, resume_command
 from flytune.runs.shipped import shipped_files, shipped_names
 from flytune.task.task import Task, load_task, read_task_text
 
@@ -100,8 +100,8 @@ def _shipped(name: str, wanted: Task | None) -> FoundController:
 def _from_run(name: str, path: Path, wanted: Task | None) -> FoundController:
     facts = read_facts(path)
     if not (path / "policy.safetensors").exists():
-        begun = (path / "checkpoint" / "learner.safetensors").exists()
-        remedy = f"Go on with: {resume_command(path, facts['trainer'], facts['seed'])}" if begun else "Train it again."
+        command = resume_command(path, facts["trainer"], facts["seed"])
+        remedy = f"Continue it with: {command}" if has_checkpoint(path) else "Train it again."
         raise BadInput(f"{name}: its training has not ended. {remedy}")
     policy = load_policy(path / "policy.safetensors")
     about = {

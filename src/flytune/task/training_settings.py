@@ -1,7 +1,8 @@
-"""Trainer settings: how a task is learned, kept beside what is learned so that one file says all (paper R16 to R18)."""
+"""Trainer settings: how a task is learned. They are part of the task, so that one file holds all (paper R16 to R18)."""
 
+import dataclasses
 import math
-from typing import Annotated
+from typing import Annotated, Any, Protocol
 
 from annotated_types import Ge, Gt, Le, Lt, Unit
 
@@ -12,6 +13,38 @@ from flytune.task.initial_state import InitialState
 Share = Annotated[Real, Ge(0), Le(1), Unit("1")]
 Positive = Annotated[Real, Gt(0), Unit("1")]
 Count = Annotated[Whole, Ge(1), Le(1_000_000)]
+
+
+class TrainerSettings(Protocol):
+    """The part of the settings that is the same for every trainer."""
+
+    @property
+    def hidden(self) -> tuple[int, ...]:
+        """The sizes of the hidden layers of the actor."""
+        ...
+
+    @property
+    def updates(self) -> int:
+        """The number of updates of a training."""
+        ...
+
+    @property
+    def steps_per_update(self) -> int:
+        """The number of environment steps of one update."""
+        ...
+
+    def with_steps(self, steps: int) -> "TrainerSettings":
+        """The settings of a training of `steps` environment steps, rounded up to whole updates."""
+        ...
+
+    def tuned(self, *, slow: bool, warm_start: bool) -> dict[str, tuple[Any, str]]:
+        """The settings that a tuning changes by itself: name -> value and reason.
+
+        Args:
+            slow: the wanted response is slow.
+            warm_start: the training starts from a policy that flies.
+        """
+        ...
 
 
 @pytree
@@ -30,12 +63,12 @@ class PpoSettings:
     value_weight: Annotated[Real, Ge(0), Unit("1")] = 0.5
     entropy_weight: Annotated[Real, Ge(0), Unit("1")] = 0.0
     max_grad_norm: Annotated[Real, Gt(0), Unit("1")] = 0.5
-    clip_apart: bool = False  # actor and critic each get their own max_grad_norm, so that neither drowns the other
-    final_learning_rate: Share = 1.0  # as a share of the first, reached along a line
+    clip_apart: bool = False  # max_grad_norm applies to the gradients of actor and critic separately
+    final_learning_rate: Share = 1.0  # as a share of the first, reached linearly
     input_scale: tuple[Positive, Positive, Positive, Positive, Positive] = (1.0, 1.0, 1.0, 1.0, 1.0)  # per block of R7
     initial_log_std: Annotated[Real, Unit("1")] = 0.0
     hidden: tuple[Count, ...] = (64, 64)  # R16
-    ema_decay: Annotated[Real, Ge(0), Lt(1), Unit("1 per update")] = 0.95  # weights kept from before, flown policy
+    ema_decay: Annotated[Real, Ge(0), Lt(1), Unit("1 per update")] = 0.95  # share of the old weights in the flown ones
 
     def problem(self) -> str | None:
         """What makes the numbers impossible together, or None."""
@@ -48,15 +81,29 @@ class PpoSettings:
 
     @property
     def updates(self) -> int:
-        """How many updates the steps make."""
-        return math.ceil(self.steps / (self.environments * self.rollout))
+        """The number of updates of a training."""
+        return math.ceil(self.steps / self.steps_per_update)
+
+    @property
+    def steps_per_update(self) -> int:
+        """The number of environment steps of one update."""
+        return self.environments * self.rollout
+
+    def with_steps(self, steps: int) -> "PpoSettings":
+        """The settings of a training of `steps` environment steps, rounded up to whole updates."""
+        return dataclasses.replace(self, steps=steps)
+
+    def tuned(self, *, slow: bool, warm_start: bool) -> dict[str, tuple[Any, str]]:
+        """The settings that a tuning changes by itself: none."""
+        return {}
 
 
 @pytree
 class ApgSettings:
     """Analytic policy gradient: gradient ascent on the reward, through the simulator (our own; not in the paper).
 
-    It trains from its own, wider starts: a policy that keeps the speed bound from 2 m away has to have been there.
+    It has its own initial states, which are wider than those of the task. A policy learns to keep the speed bound from
+    2 m away only if it is trained there.
     """
 
     initial_state: InitialState = InitialState(
@@ -67,17 +114,36 @@ class ApgSettings:
     )
     updates: Count = 300
     environments: Count = 64
-    window: Annotated[Whole, Ge(1), Le(1_000_000), Unit("steps")] = 250  # what one gradient looks through
+    window: Annotated[Whole, Ge(1), Le(1_000_000), Unit("steps")] = 250  # of each episode in one gradient
     learning_rate: Annotated[Real, Gt(0), Unit("1")] = 5e-3
     final_learning_rate: Share = 0.02  # as a share of the first, reached by a cosine
     adam_b1: Annotated[Real, Ge(0), Lt(1), Unit("1")] = 0.7  # Adam's b1
     adam_b2: Annotated[Real, Ge(0), Lt(1), Unit("1")] = 0.95  # Adam's b2
     max_grad_norm: Annotated[Real, Gt(0), Unit("1")] = 1.0
     barrier_weight: Annotated[Real, Ge(0), Unit("1")] = 30.0
-    barrier_margin: Annotated[Real, Ge(0), Lt(1), Unit("1")] = 0.1  # the barrier begins where less than this is left
-    termination_slack: Annotated[Real, Ge(0), Unit("1")] = (
-        0.0  # an episode goes on until a bound is passed by this share of it
-    )
+    barrier_margin: Annotated[Real, Ge(0), Lt(1), Unit("1")] = 0.1  # the barrier begins below this margin
+    termination_slack: Annotated[Real, Ge(0), Unit("1")] = 0.0  # share of a bound; beyond it by more, an episode ends
     input_scale: tuple[Positive, Positive, Positive, Positive, Positive] = (2.0, 3.0, 2.0, 0.3, 1.0)  # per block of R7
     hidden: tuple[Count, ...] = (64, 64)
     ema_decay: Annotated[Real, Ge(0), Lt(1), Unit("1 per update")] = 0.95
+
+    @property
+    def steps_per_update(self) -> int:
+        """The number of environment steps of one update."""
+        return self.environments * self.window
+
+    def with_steps(self, steps: int) -> "ApgSettings":
+        """The settings of a training of `steps` environment steps, rounded up to whole updates."""
+        return dataclasses.replace(self, updates=math.ceil(steps / self.steps_per_update))
+
+    def tuned(self, *, slow: bool, warm_start: bool) -> dict[str, tuple[Any, str]]:
+        """The settings that a tuning changes by itself, see `TrainerSettings`."""
+        changes: dict[str, tuple[Any, str]] = {
+            "termination_slack": (max(0.5, float(self.termination_slack)), "tuned: as the refined presets")
+        }
+        if slow:
+            changes["window"] = (max(500, self.window), "tuned: a slow response is seen whole")
+        if warm_start:
+            changes["updates"] = (200, "tuned: it starts from a policy that flies")
+            changes["learning_rate"] = (0.002, "tuned: it starts from a policy that flies")
+        return changes

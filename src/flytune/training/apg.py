@@ -16,7 +16,6 @@ from jaxtyping import Array, Float
 
 from flytune.config.pytree import pytree
 from flytune.control.policy import Network, Policy, make_network
-from flytune.errors import BadInput
 from flytune.simulation import environment
 from flytune.simulation.environment import Episode, Outcome
 from flytune.task.observation import NOISY, SIZE, input_scale
@@ -92,22 +91,15 @@ def forgiven(task: Task, moved: Episode, outcome: Outcome, settings: ApgSettings
     return dataclasses.replace(outcome, cause=beyond, terminated=terminated, truncated=truncated)
 
 
-def go_on_from(settings: ApgSettings, train_state: TrainState, initial: Policy) -> TrainState:
-    """A learner before its first update whose actor flies as `initial` does, which saw other multiples of the inputs.
+def warm_start(settings: ApgSettings, train_state: TrainState, policy: Policy) -> TrainState:
+    """The training state before the first update, with an actor that flies as `policy` does.
 
-    Raises:
-        BadInput: `initial` has other layers, or another squash.
+    The policy may have been trained on other multiples of the observation; the first layer makes up for that.
     """
-    shapes, wanted = ([weight.shape for weight in each.weights] for each in (initial.actor, train_state.actor))
-    if shapes != wanted or initial.squash != "tanh":
-        raise BadInput(
-            f"initial: a policy with layers {shapes} and squash {initial.squash} cannot be gone on from. "
-            f"Allowed: layers {wanted} and squash tanh, as trainer apg makes them."
-        )
-    first, *others = initial.actor.weights
-    ratio = initial.input_scale / input_scale(settings.input_scale)
-    actor = dataclasses.replace(initial.actor, weights=(first * ratio[:, None], *others))
-    actor = jax.tree.map(jnp.array, actor)  # copies: an update gives its learner's memory away
+    first, *others = policy.actor.weights
+    ratio = policy.input_scale / input_scale(settings.input_scale)
+    actor = dataclasses.replace(policy.actor, weights=(first * ratio[:, None], *others))
+    actor = jax.tree.map(jnp.array, actor)  # copies, because an update donates the memory of its state
     return dataclasses.replace(train_state, actor=actor, ema=jax.tree.map(jnp.array, actor))
 
 

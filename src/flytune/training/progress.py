@@ -1,19 +1,71 @@
-"""Progress on standard error: a bar on a terminal, a line every tenth of the way elsewhere."""
+"""The progress of a training: how far it is, how fast, and how that is shown on standard error."""
 
 import contextlib
+import dataclasses
 import sys
+import time
 from collections.abc import Callable, Iterator
 
 from rich.console import Console
 from rich.progress import BarColumn, TaskProgressColumn, TextColumn
 from rich.progress import Progress as Bar
 
-from flytune.training.loop import Progress
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Progress:
+    """How far a training is."""
+
+    label: str  # task, trainer and seed
+    update: int
+    updates: int
+    steps: int
+    steps_per_second: float
+    seconds_left: float
+    reward: float  # mean per step
+
+
+class Clock:
+    """The time and the speed of a training. The first update compiles, so later updates alone give the speed.
+
+    Args:
+        label: of the training.
+        updates: number of updates of the whole training.
+        steps_per_update: environment steps of one update.
+        first: number of updates before this process, where a training is resumed.
+        before: seconds of these updates.
+    """
+
+    def __init__(self, label: str, updates: int, steps_per_update: int, first: int = 0, before: float = 0.0) -> None:
+        self.label, self.updates, self.steps_per_update = label, updates, steps_per_update
+        self._first, self._before = first, before
+        self._started = self._compiled = time.monotonic()
+
+    def seconds(self, update: int) -> float:
+        """Seconds of training up to the end of an update, which is now."""
+        now = time.monotonic()
+        if update == self._first + 1:
+            self._compiled = now
+        return self._before + now - self._started
+
+    def progress(self, update: int, reward: float) -> Progress:
+        """How far the training is after an update."""
+        since = self._compiled if update > self._first + 1 else self._started
+        counted = max(update - self._first - 1, 1)
+        rate = counted * self.steps_per_update / max(time.monotonic() - since, 1e-9)
+        return Progress(
+            label=self.label,
+            update=update,
+            updates=self.updates,
+            steps=update * self.steps_per_update,
+            steps_per_second=rate,
+            seconds_left=(self.updates - update) * self.steps_per_update / rate,
+            reward=reward,
+        )
 
 
 @contextlib.contextmanager
 def show_progress() -> Iterator[Callable[[Progress], None]]:
-    """What to hand to `train` as `on_progress`."""
+    """The function for `on_progress` of `train`: it draws a bar on a terminal, and prints ten lines elsewhere."""
     console = Console(stderr=True)
     if console.is_terminal:
         columns = (
@@ -23,7 +75,7 @@ def show_progress() -> Iterator[Callable[[Progress], None]]:
             TextColumn("{task.fields[text]}"),
         )
         with Bar(*columns, console=console) as bar:
-            # compiling takes longest where nothing is cached yet, and would otherwise look like a hang
+            # without a cache, compiling takes longest; without a message it would look like a hang
             task = bar.add_task("compiling (once per machine and program)", total=None, text="")
             yield lambda progress: bar.update(
                 task,

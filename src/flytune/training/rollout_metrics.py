@@ -1,11 +1,14 @@
-"""What every trainer writes down about the flights of an update."""
+"""The metrics of an update: what its rollout measured, and the row of metrics.jsonl."""
 
+import math
 from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array
 
+from flytune.errors import Diverged
 from flytune.simulation.environment import Episode, Outcome
 from flytune.task.task import Task
 from flytune.task.termination import causes
@@ -34,3 +37,38 @@ def account(task: Task, outcome: Outcome, moved: Episode) -> dict[str, Any]:
         "episode_reward": mean_at_end(moved.reward),
         "episode_length": mean_at_end(moved.steps),
     }
+
+
+def metrics_row(task: Task, measured: dict[str, Any], update: int, steps: int, seconds: float) -> dict[str, Any]:
+    """The row of metrics.jsonl of one update; a mean over episodes is None where no episode ended.
+
+    Args:
+        task: what is trained.
+        measured: what the update measured, see `account`, and its losses.
+        update: its number, 1 for the first.
+        steps: environment steps of the training so far.
+        seconds: of the training so far.
+
+    Raises:
+        Diverged: a number is not finite.
+    """
+    values = jax.tree.map(np.asarray, measured)
+
+    def number(value: np.ndarray) -> float | None:
+        return float(value) if np.isfinite(value) else None
+
+    row: dict[str, Any] = {"update": update, "steps": steps, "seconds": round(seconds, 3)}
+    row["episode_reward"] = number(values.pop("episode_reward"))
+    row["reward"] = float(values.pop("reward"))
+    row["terms"] = {name: float(value) for name, value in values.pop("terms").items()}
+    row["terminations"] = dict(zip(causes(task.termination), map(int, values.pop("terminations")), strict=True))
+    row["episodes"] = int(values.pop("episodes"))
+    row["episode_length"] = number(values.pop("episode_length"))
+    row |= {name: float(value) for name, value in sorted(values.items())}
+    for name, value in row.items():
+        if isinstance(value, float) and not math.isfinite(value):
+            raise Diverged(
+                f"training: {name} is {value} in update {update} ({steps} environment steps). "
+                "A smaller learning_rate, or smaller weights in the reward, may help."
+            )
+    return row

@@ -9,7 +9,6 @@ goes on bit by bit.
 # PyTorch is in no pinned requirement; without it the rest is checked all the same
 
 import contextlib
-import json
 import random
 from collections.abc import Iterator
 from typing import Any
@@ -22,9 +21,8 @@ from jaxtyping import Array
 from flytune.adapters.batch import Transition
 from flytune.config.pytree import pytree, static
 from flytune.control.policy import Network, Policy
-from flytune.errors import BadInput, Diverged
+from flytune.errors import Diverged
 from flytune.export.untrusted.sb3_model import actor_network
-from flytune.extras import require
 from flytune.simulation.environment import Episode
 from flytune.task.observation import SIZE
 from flytune.task.task import Task
@@ -41,9 +39,6 @@ LOSSES = {  # our names -> what Stable-Baselines3 logs
     "explained_variance": "train/explained_variance",
     "std": "train/std",
 }
-
-# settings of our PPO that Stable-Baselines3's has not
-OURS_ALONE = ("clip_apart", "final_learning_rate", "input_scale")
 
 # what a Gaussian with numbers that are not finite, an overflowing step of Adam, and our environments are refused with
 REFUSALS = ("Expected parameter", "overflow", "not finite")
@@ -65,31 +60,6 @@ class TrainState:
     numpy_random: Any  # the state of NumPy's: minibatches
     minibatches: Array  # Adam's steps
     updates: Array
-
-
-def check_installed() -> None:
-    """Nothing, where Stable-Baselines3 is installed.
-
-    Raises:
-        BadInput: it is not.
-    """
-    for package in ("gymnasium", "torch", "stable_baselines3"):
-        require(package, "sb3")
-
-
-def check_settings(settings: PpoSettings) -> None:
-    """Nothing, where Stable-Baselines3's PPO has all that the settings ask for.
-
-    Raises:
-        BadInput: it lacks one of them.
-    """
-    for name in OURS_ALONE:
-        given, allowed = (np.asarray(getattr(each, name)).tolist() for each in (settings, PpoSettings()))
-        if given != allowed:
-            raise BadInput(
-                f"ppo.{name}: {json.dumps(given)} is not allowed with trainer sb3, whose PPO has no such setting. "
-                f"Allowed: {json.dumps(allowed)}. Set it so, or use trainer ppo."
-            )
 
 
 def policy(settings: PpoSettings, train_state: TrainState) -> Policy:

@@ -8,6 +8,7 @@ from typing import Any
 from flytune.config import document
 from flytune.errors import BadInput
 from flytune.task.task import Task
+from flytune.training.trainer import DEFAULT_TRAINER, other_settings_fields
 from flytune.tuning.iteration import HALF_WAY, Edit, Step
 from flytune.tuning.requirement import Requirement
 from flytune.tuning.rules import Rule, conditions, field_of, is_fixed, is_whole, moved
@@ -47,7 +48,7 @@ def choose(
     rules: Sequence[Rule],
     effects: Effects,
     fixed: Sequence[str],
-    trainer: str = "apg",
+    trainer: str = DEFAULT_TRAINER,
 ) -> tuple[Step, Edit] | list[str]:
     """The step to go on from and its edit; where no rule can help, why not, one line for each that was looked at.
 
@@ -147,7 +148,7 @@ def _edit(case: _Case, rule: Rule, step: Step) -> Edit | str:
     """The edit a rule asks for, or why the rule is not used."""
     misses = case.requirement.misses(step.measured)
     axis = case.requirement.axis
-    if rule.field.split(".")[0] in {"apg", "ppo"} - {case.trainer}:
+    if rule.field.split(".")[0] in other_settings_fields(case.trainer):
         return f"{rule.field} is of another trainer"
     if is_fixed(rule.field, case.fixed):
         return f"{rule.field} is set by the user"

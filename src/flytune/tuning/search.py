@@ -13,9 +13,10 @@ from flytune.config import document
 from flytune.config.files import write_json, write_text
 from flytune.control.policy import Policy, load_policy
 from flytune.errors import BadInput, Diverged, Interrupted
-from flytune.runs.directory import first_difference
+from flytune.runs.directory import first_difference, has_checkpoint
 from flytune.task.task import Task, load_task, write_task
 from flytune.training.loop import Progress, train
+from flytune.training.trainer import DEFAULT_TRAINER, find_trainer
 from flytune.tuning.choose import choose
 from flytune.tuning.iteration import Edit, Step
 from flytune.tuning.journal import read_journal, write_journal
@@ -191,7 +192,7 @@ class Tuner:
         """One more step: the start's task with these values, trained on from step `origin`, and flown."""
         task = self.task_of(number, values, reasons)
         initial = None
-        if self.trainer == "apg" and origin is not None:
+        if find_trainer(self.trainer).supports_warm_start and origin is not None:
             initial = load_policy(self._folder(origin) / "policy.safetensors")
         diverged, seconds = "", 0.0
         try:
@@ -210,13 +211,13 @@ class Tuner:
 
     def learn(self, task: Task, initial: Policy | None, folder: Path) -> tuple[Policy, float]:
         """The policy of a task, trained into `folder` or gone on with there, and the seconds it took."""
-        resumable = (folder / "checkpoint" / "learner.safetensors").exists()
+        resumable = has_checkpoint(folder)
         if resumable:  # of another version of flytune, perhaps, which chose another edit
             resumable = first_difference(document.plain(load_task(folder / "task.toml")), document.plain(task)) is None
         if folder.exists() and not resumable:
             shutil.rmtree(folder)
         run = train(
-            task, self.trainer, seed=self.seed, out=folder, resume=resumable, initial=initial,
+            task, self.trainer, seed=self.seed, out=folder, resume=resumable, warm_start=initial,
             on_progress=self.on_progress,
         )  # fmt: skip
         return run.policy, run.metrics[-1]["seconds"]
@@ -308,7 +309,7 @@ def tune(
     task: str | None = None,
     edits: Mapping[str, Any] | None = None,
     seed: int = 0,
-    trainer: str = "apg",
+    trainer: str = DEFAULT_TRAINER,
     most_steps: int = MOST_STEPS,
     resume: bool = False,
     tell: Tell = lambda line: None,
@@ -334,8 +335,7 @@ def tune(
         Diverged: numbers stopped being finite in a training.
         Interrupted: Ctrl-C; what was done is kept.
     """
-    if trainer not in ("apg", "ppo"):
-        raise BadInput(f"trainer: {trainer!r} is not allowed. Allowed: apg, ppo.")
+    find_trainer(trainer, every_task=True)
     if not 1 <= most_steps <= 100:
         raise BadInput(f"steps: {most_steps} is not allowed. Allowed: a whole number, 1 to 100.")
     if not 0 <= seed < 2**32:

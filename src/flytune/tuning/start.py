@@ -12,8 +12,9 @@ from flytune.control.policy import Policy, load_policy
 from flytune.errors import BadInput
 from flytune.evaluation.fly import fly
 from flytune.evaluation.judge import Judgement, judge
-from flytune.runs.shipped import DEFAULT_TRAINER, shipped_files, shipped_names
+from flytune.runs.shipped import shipped_files, shipped_name, shipped_names
 from flytune.task.task import Task, load_task
+from flytune.training.trainer import find_trainer
 from flytune.tuning.feasibility import check_possible
 from flytune.tuning.requirement import Requirement
 from flytune.tuning.rules import is_fixed
@@ -107,13 +108,9 @@ def _prepared(task: Task, requirement: Requirement, trainer: str, goes_on: bool,
     }
     if horizon > task.horizon:
         wanted["horizon"] = (horizon, "tuned: the episodes are longer than the response that is asked for")
-    if trainer == "apg":
-        wanted["apg.termination_slack"] = (max(0.5, float(task.apg.termination_slack)), "tuned: as the refined presets")
-        if requirement.settling_time >= SLOW:
-            wanted["apg.window"] = (max(500, task.apg.window), "tuned: a slow response is seen whole")
-        if goes_on:
-            wanted["apg.updates"] = (200, "tuned: it goes on from a policy that flies")
-            wanted["apg.learning_rate"] = (0.002, "tuned: it goes on from a policy that flies")
+    learner = find_trainer(trainer)
+    settings = learner.settings(task).tuned(slow=requirement.settling_time >= SLOW, warm_start=goes_on)
+    wanted |= {f"{learner.settings_field}.{name}": change for name, change in settings.items()}
     return edited(task, {path: what for path, what in wanted.items() if not is_fixed(path, fixed)})
 
 
@@ -133,7 +130,9 @@ def _known_tasks(edits: Mapping[str, Any]) -> dict[str, Task]:
 
 def _shipped(name: str, task: Task, trainer: str) -> tuple[Path, Path] | None:
     """The policy that ships for a known task, unless the user wants layers it does not have."""
-    if name not in KNOWN or (trainer == DEFAULT_TRAINER and task.apg.hidden != load_task(name).apg.hidden):
+    if name not in KNOWN:
         return None
-    known = name if trainer == DEFAULT_TRAINER else f"{name}@{trainer}"
+    learner, known = find_trainer(trainer), shipped_name(name, trainer)
+    if learner.supports_warm_start and learner.settings(task).hidden != learner.settings(load_task(name)).hidden:
+        return None
     return shipped_files(known) if known in shipped_names() else None

@@ -1,0 +1,220 @@
+"""Trainers: the ways to learn a policy, and the one list of them.
+
+A new trainer is a module that offers the functions of `Algorithm`, and one entry of `TRAINERS`. This module imports no
+JAX, so that the command line names the trainers without waiting for it.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from importlib import import_module
+from typing import TYPE_CHECKING, Any, Protocol
+
+from flytune.errors import BadInput
+from flytune.extras import require
+from flytune.runs.shipped import DEFAULT_TRAINER
+
+if TYPE_CHECKING:
+    from jax import Array
+
+    from flytune.control.policy import Policy
+    from flytune.task.task import Task
+    from flytune.task.training_settings import TrainerSettings
+
+__all__ = [
+    "DEFAULT_TRAINER",
+    "TRAINERS",
+    "Algorithm",
+    "Trainer",
+    "find_trainer",
+    "other_settings_fields",
+    "trainer_names",
+]
+
+
+class Algorithm(Protocol):
+    """The functions of a trainer's module. They are pure; `TrainState` is a JAX pytree of the module's own."""
+
+    def start(self, task: Task, settings: Any, key: Array) -> Any:
+        """The training state before the first update."""
+        ...
+
+    def update(self, task: Task, settings: Any, train_state: Any) -> tuple[Any, dict[str, Any]]:
+        """The training state after one update, and the metrics of its rollout (see `rollout_metrics`) and its losses."""
+        ...
+
+    def policy(self, settings: Any, train_state: Any) -> Policy:
+        """The policy that is flown."""
+        ...
+
+    def last_policy(self, settings: Any, train_state: Any) -> Policy:
+        """The policy of the last update."""
+        ...
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Trainer:
+    """A way to learn a policy.
+
+    Args:
+        name: as in `--trainer`.
+        summary: one line for help texts.
+        module: offers the functions of `Algorithm`, and `warm_start(settings, train_state, policy)` where supported.
+        settings_field: the field of the task that holds the settings, see `TrainerSettings`.
+        extra: the extra of flytune that brings `packages`.
+        packages: optional packages that the trainer needs; run.json records their versions.
+        missing_settings: settings that the trainer lacks, which must therefore have their default values.
+        supports_warm_start: whether a training can start from the weights of a policy.
+    """
+
+    name: str
+    summary: str
+    module: str
+    settings_field: str
+    extra: str = ""
+    packages: tuple[str, ...] = ()
+    missing_settings: tuple[str, ...] = ()
+    supports_warm_start: bool = False
+
+    @property
+    def trains_every_task(self) -> bool:
+        """Whether no setting of a task is refused."""
+        return not self.missing_settings
+
+    def settings(self, task: Task) -> TrainerSettings:
+        """The settings of this trainer in a task."""
+        return getattr(task, self.settings_field)
+
+    def with_steps(self, task: Task, steps: int) -> Task:
+        """The task with a training of about `steps` environment steps, rounded up to whole updates.
+
+        Raises:
+            BadInput: no step.
+        """
+        if steps < 1:
+            raise BadInput(f"steps: {steps} is not allowed. Allowed: a whole number, 1 or more environment steps.")
+        changed: Any = {self.settings_field: self.settings(task).with_steps(steps)}
+        return dataclasses.replace(task, **changed)
+
+    def check(self, task: Task) -> None:
+        """Refuse a task that this trainer cannot train here, before anything is written.
+
+        Raises:
+            BadInput: a package is not installed, or the trainer lacks a setting that the task uses.
+        """
+        import numpy as np
+
+        for package in self.packages:
+            require(package, self.extra)
+        settings = self.settings(task)
+        for name in self.missing_settings:
+            value, default = (np.asarray(getattr(each, name)).tolist() for each in (settings, type(settings)()))
+            if value != default:
+                raise BadInput(
+                    f"{self.settings_field}.{name}: {json.dumps(value)} is not allowed with trainer {self.name}, which "
+                    f"has no such setting. Allowed: {json.dumps(default)}. Give this value, or another trainer."
+                )
+
+    def start(self, task: Task, key: Array) -> Any:
+        """The training state before the first update."""
+        return self._algorithm().start(task, self.settings(task), key)
+
+    def update(self, task: Task, train_state: Any) -> tuple[Any, dict[str, Any]]:
+        """The training state after one update, and what the update measured. The state before may not be used again."""
+        return self._algorithm().update(task, self.settings(task), train_state)
+
+    def policy(self, task: Task, train_state: Any) -> Policy:
+        """The policy that is flown."""
+        return self._algorithm().policy(self.settings(task), train_state)
+
+    def last_policy(self, task: Task, train_state: Any) -> Policy:
+        """The policy of the last update."""
+        return self._algorithm().last_policy(self.settings(task), train_state)
+
+    def warm_start(self, task: Task, train_state: Any, policy: Policy) -> Any:
+        """The training state before the first update, with an actor that flies as `policy` does.
+
+        Raises:
+            BadInput: see `check_warm_start`.
+        """
+        self.check_warm_start(task, policy)
+        algorithm: Any = self._algorithm()
+        return algorithm.warm_start(self.settings(task), train_state, policy)
+
+    def check_warm_start(self, task: Task, policy: Policy) -> None:
+        """Refuse a warm start that is not possible, before anything is written.
+
+        Raises:
+            BadInput: the trainer has no warm start, or its policies have other layers or another squash.
+        """
+        import jax
+
+        if not self.supports_warm_start:
+            able = ", ".join(trainer_names(warm_start=True))
+            raise BadInput(f"warm_start: trainer {self.name} cannot start from a policy. Allowed: trainer {able}.")
+        own = jax.eval_shape(lambda key: self.policy(task, self.start(task, key)), jax.random.key(0))
+        given, allowed = ([weight.shape for weight in each.actor.weights] for each in (policy, own))
+        if (given, policy.squash) != (allowed, own.squash):
+            raise BadInput(
+                f"warm_start: a policy with layers {given} and squash {policy.squash} is not allowed. "
+                f"Allowed: layers {allowed} and squash {own.squash}, as trainer {self.name} makes them for this task."
+            )
+
+    def _algorithm(self) -> Algorithm:
+        return import_module(self.module)  # pyright: ignore[reportReturnType]
+
+
+TRAINERS = {
+    trainer.name: trainer
+    for trainer in (
+        Trainer(
+            name="apg",
+            summary="analytic policy gradient, through the differentiable simulator",
+            module="flytune.training.apg",
+            settings_field="apg",
+            supports_warm_start=True,
+        ),
+        Trainer(
+            name="ppo",
+            summary="proximal policy optimisation, the algorithm of the paper",
+            module="flytune.training.ppo",
+            settings_field="ppo",
+        ),
+        Trainer(
+            name="sb3",
+            summary="the PPO of Stable-Baselines3, the software of the paper, with the settings of ppo",
+            module="flytune.training.sb3",
+            settings_field="ppo",
+            extra="sb3",
+            packages=("gymnasium", "torch", "stable_baselines3"),
+            missing_settings=("clip_apart", "final_learning_rate", "input_scale"),
+        ),
+    )
+}
+
+
+def trainer_names(*, every_task: bool = False, warm_start: bool = False) -> tuple[str, ...]:
+    """The names of all trainers, or of those that can train every task, or that support a warm start."""
+    return tuple(
+        name
+        for name, trainer in TRAINERS.items()
+        if (trainer.trains_every_task or not every_task) and (trainer.supports_warm_start or not warm_start)
+    )
+
+
+def other_settings_fields(name: str) -> set[str]:
+    """The fields of a task that hold settings of trainers, without that of one trainer."""
+    return {trainer.settings_field for trainer in TRAINERS.values()} - {TRAINERS[name].settings_field}
+
+
+def find_trainer(name: str, *, every_task: bool = False) -> Trainer:
+    """The trainer of a name.
+
+    Raises:
+        BadInput: there is none, or it cannot train every task where that is needed.
+    """
+    names = trainer_names(every_task=every_task)
+    if name not in names:
+        raise BadInput(f"trainer: {name!r} is not allowed. Allowed: {', '.join(names)}.")
+    return TRAINERS[name]
