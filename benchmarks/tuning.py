@@ -1,16 +1,17 @@
-"""Is the heuristic any good? The tuner, Optuna's TPE and random search on the same requirements, with the same budget.
+"""Compare the tuner with Optuna's TPE and random search, on the same requirements and with the same budget.
 
-    python benchmarks/tuning.py --out tuning-benchmark           # about two hours on two cores; what is done is kept
-    python benchmarks/tuning.py --out tuning-benchmark --docs    # docs/results/tuning/benchmark.md from what is there
+    python benchmarks/tuning.py --out tuning-benchmark           # about two hours on two cores; can be continued
+    python benchmarks/tuning.py --out tuning-benchmark --docs    # the page of the documentation from the results there
 
-Every method begins with the same known policy, trains with the same settings, may train twelve times, looks at the
-same tuning starts, and is judged on the same fresh ones. TPE and random search draw the fields the rules may edit from
-the rules' ranges, in logarithms, each training going on from the known policy; TPE minimises what the tuner does, the
-distance from what is asked of the tuning starts, and is told how the known policy flies before its first draw; its
-first four draws are random. Settings of the training itself are left as they are; the tuner may train longer.
+Every method starts from the same known policy, uses the same training settings, may train twelve times, compares its
+policies on the same training set, and is judged on the same validation sets. TPE and random search draw the fields that
+the rules may edit from the ranges of the rules, on a logarithmic scale; each of their trainings starts from the known
+policy. TPE minimises what the tuner minimises, the distance from the requirement on the training set. It is given the
+result of the known policy first, and its first four draws are random. They leave the settings of the trainer as they
+are; the tuner may train longer.
 
-A training that was made before (the same task, first policy and seed) is taken from the cache that all share; its
-seconds count as if it had been made again. One process per core; one JSON per requirement, method and seed.
+All methods share a cache of trainings (same task, first policy and seed). A training from the cache counts with its
+seconds, as if it had been made again. One process per core; one JSON file per requirement, method and seed.
 """
 
 import argparse
@@ -45,7 +46,7 @@ GRID: list[tuple[float, float, float, dict[str, Any], dict[str, float]]] = [
     (5.0, 5.0, 0.01, {}, {SPEED: 0.8}),
     (6.0, 5.0, 0.01, {"at_most": True}, {SPEED: 0.5}),
     (5.0, 5.0, 0.01, {}, {SPEED: 0.45}),
-    # impossible: to be refused
+    # impossible, has to be refused
     (1.5, 5.0, 0.01, {}, {SPEED: 0.8}),
     (5.0, 5.0, 0.01, {"at_most": True}, {SPEED: 0.2}),
     (0.3, 5.0, 0.01, {}, {}),
@@ -71,19 +72,19 @@ def name_of(index: int) -> str:
 
 
 def solve(folder: Path, index: int, method: str, seed: int) -> None:
-    """One requirement by one method, written down."""
+    """Try one requirement with one method, and write the result to a file."""
     import jax
 
     from flytune.config.document import plain
     from flytune.control.policy import Policy, load_policy
     from flytune.errors import BadInput
     from flytune.task.task import Task
+    from flytune.tuning.loop import Tuner
     from flytune.tuning.requirement import make_requirement
     from flytune.tuning.rules import load_rules
-    from flytune.tuning.search import Tuner
 
     class CachedTuner(Tuner):
-        """A tuner that makes no training twice."""
+        """A tuner that repeats no training."""
 
         spent = 0.0  # s in trainings made now
 
@@ -117,14 +118,14 @@ def solve(folder: Path, index: int, method: str, seed: int) -> None:
     row: dict[str, Any] = {"requirement": name_of(index), "method": method, "seed": seed}
     try:
         tuner = CachedTuner(
-            requirement, load_rules(), work, task=None, edits=fixed, seed=seed, trainer="apg", most_steps=BUDGET,
-            tell=said.append, on_progress=None,
+            requirement, load_rules(), work, task=None, edits=fixed, seed=seed, trainer="apg", most_iterations=BUDGET,
+            on_message=said.append, on_progress=None,
         )  # fmt: skip
     except BadInput as refusal:
         row |= {"refused": str(refusal), "seconds": round(time.monotonic() - began, 1)}
     else:
         met = tuner.run().met if method == "tuner" else search(tuner, method, seed)
-        trainings = [step.seconds for step in tuner.steps[1:]]
+        trainings = [each.seconds for each in tuner.history.iterations[1:]]
         elsewhere = time.monotonic() - began - tuner.spent
         row |= {"met": met, "trainings": len(trainings), "seconds": round(elsewhere + sum(trainings), 1), "said": said}
     shutil.rmtree(work, ignore_errors=True)
@@ -136,24 +137,25 @@ def solve(folder: Path, index: int, method: str, seed: int) -> None:
 
 
 def search(tuner: Any, method: str, seed: int) -> bool:
-    """Whether Optuna meets what the tuner is asked for, from the policy the tuner begins with, within the budget."""
+    """Whether Optuna meets the requirement within the budget, from the policy the tuner starts with."""
     import optuna
 
-    from flytune.tuning.rules import field_of
+    from flytune.tuning.rules import number_at
 
     optuna.logging.set_verbosity(optuna.logging.WARNING)
 
-    def left(step: Any) -> float:
-        return sum(tuner.target.parts(step.measured).values())
+    def distance(iteration: Any) -> float:
+        return tuner.target.distance(iteration.response)
 
     ranges = {
         rule.field: tuple(map(float, rule.range))
         for rule in tuner.rules
         if rule.field
-        and rule.field not in tuner.fixed
+        and rule.field not in tuner.edits
         and rule.field.split(".")[0] not in ("apg", "ppo")
-        and field_of(tuner.tables, rule.field)
+        and number_at(tuner.tables, rule.field)
     }
+    history = tuner.history
     tuner.begin()
     samplers = {
         "tpe": optuna.samplers.TPESampler(seed=seed, n_startup_trials=5),  # the known policy, and four draws
@@ -162,26 +164,25 @@ def search(tuner: Any, method: str, seed: int) -> bool:
     study = optuna.create_study(sampler=samplers[method])
     study.add_trial(
         optuna.trial.create_trial(
-            params={name: min(max(field_of(tuner.tables, name), low), high) for name, (low, high) in ranges.items()},
+            params={name: min(max(number_at(tuner.tables, name), low), high) for name, (low, high) in ranges.items()},
             distributions={
                 name: optuna.distributions.FloatDistribution(low, high, log=True)
                 for name, (low, high) in ranges.items()
             },
-            value=left(tuner.steps[0]),
+            value=distance(history.iterations[0]),
         )
     )
     while True:
-        step = tuner.steps[-1]
-        if not tuner.target.misses(step.measured) and not tuner.verdict(step).misses:
+        last = history.iterations[-1]
+        if not tuner.target.misses(last.response) and not tuner.validate(last).misses:
             return True
-        if len(tuner.steps) > BUDGET:
-            nearest = tuner.nearest()
-            unjudged = all(verdict.step != nearest.number for verdict in tuner.verdicts)
-            return unjudged and not tuner.verdict(nearest).misses
+        if len(history.iterations) > BUDGET:
+            nearest = history.nearest(tuner.requirement, tuner.target)
+            return not history.validated(nearest.number) and not tuner.validate(nearest).misses
         trial = study.ask()
         values = {name: trial.suggest_float(name, low, high, log=True) for name, (low, high) in ranges.items()}
-        tuner.train(len(tuner.steps), values, dict.fromkeys(values, method), None, 0)
-        study.tell(trial, left(tuner.steps[-1]))
+        tuner.train(len(history.iterations), values, dict.fromkeys(values, method), None, 0)
+        study.tell(trial, distance(history.iterations[-1]))
 
 
 def summary(folder: Path) -> str:
@@ -196,7 +197,7 @@ def summary(folder: Path) -> str:
     groups += [(f"{method}, seed 0", [row for row in first if row["method"] == method]) for method in methods]
     hard = {row["requirement"] for row in rows if row["method"] == "tuner" and row.get("trainings")}
     groups += [
-        (f"{title}, where the start does not do", [row for row in chosen if row["requirement"] in hard])
+        (f"{title}, where the start does not meet it", [row for row in chosen if row["requirement"] in hard])
         for title, chosen in groups
     ]
     lines = [
@@ -237,10 +238,10 @@ if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--out", type=Path, default=Path("tuning-benchmark"))
     parser.add_argument("--methods", nargs="+", choices=("tuner", "tpe", "random"), default=["tuner", "tpe", "random"])
-    parser.add_argument("--seeds", type=int, default=3, help="of the tuner; the others have one")
-    parser.add_argument("--requirements", type=int, nargs="+", default=range(len(GRID)), help="their places in GRID")
+    parser.add_argument("--seeds", type=int, default=3, help="number of seeds of the tuner; the other methods have one")
+    parser.add_argument("--requirements", type=int, nargs="+", default=range(len(GRID)), help="indices into GRID")
     parser.add_argument("--workers", type=int, default=os.cpu_count() or 1)
-    parser.add_argument("--docs", action="store_true", help="write docs/results/tuning/benchmark.md; tunes nothing")
+    parser.add_argument("--docs", action="store_true", help="only write the page of the documentation")
     options = parser.parse_args()
     if options.docs:
         target = Path(__file__).parents[1] / "docs" / "results" / "tuning"

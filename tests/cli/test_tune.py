@@ -48,7 +48,9 @@ def test_a_known_response_is_found_at_once_and_flies_everywhere_a_run_does(tmp_p
     assert judged["position"]["settled"] == 100
     kept = {path.name for path in (tmp_path / "mine").iterdir()}
     assert {"task.toml", "run.json", "policy.safetensors", "evaluation.json", "tune.json", "report.html"} <= kept
-    assert "tuned: trials of more than twice the settling time" in (tmp_path / "mine" / "task.toml").read_text()
+    assert (
+        "tuned: trials last more than twice the wanted settling time" in (tmp_path / "mine" / "task.toml").read_text()
+    )
     assert "already holds" in flytune("tune", "--settling-time", "3", "--out", "mine", cwd=tmp_path, expect=2).stderr
 
 
@@ -66,13 +68,13 @@ def test_what_cannot_be_met_ends_with_code_4_the_reason_and_the_best_so_far(tmp_
 def test_an_interrupted_tuning_keeps_its_steps_and_goes_on(tmp_path):
     arguments = ["tune", "baseline-refined", "--settling-time", "5", "--out", "mine"]
     message = interrupted(*arguments, cwd=tmp_path, at="50 %")
-    assert "interrupted in step 1" in message
+    assert "interrupted in iteration 1" in message
     before = json.loads((tmp_path / "mine" / "tune.json").read_text())
-    assert [step["number"] for step in before["steps"]] == [0]
+    assert [each["number"] for each in before["iterations"]] == [0]
     flytune(*arguments, "--resume", cwd=tmp_path, timeout=900)
     after = json.loads((tmp_path / "mine" / "tune.json").read_text())
     assert after["met"]
-    assert after["steps"][0] == before["steps"][0]
+    assert after["iterations"][0] == before["iterations"][0]
     # one that has ended is told again, and judged no further
     flytune(*arguments, "--resume", cwd=tmp_path)
     assert json.loads((tmp_path / "mine" / "tune.json").read_text()) == after
@@ -81,9 +83,9 @@ def test_an_interrupted_tuning_keeps_its_steps_and_goes_on(tmp_path):
 def test_an_interrupted_first_training_goes_on_where_it_was(tmp_path):
     arguments = ["tune", "baseline", "--settling-time", "5", "--out", "mine", "--steps", "1", "--set", "apg.updates=30"]
     message = interrupted(*arguments, cwd=tmp_path, at="50 %")
-    assert "interrupted in step 0" in message
+    assert "interrupted in iteration 0" in message
     assert "--out mine and --resume" in message
-    assert json.loads((tmp_path / "mine" / "tune.json").read_text())["steps"] == []
+    assert json.loads((tmp_path / "mine" / "tune.json").read_text())["iterations"] == []
     flytune(*arguments, "--resume", cwd=tmp_path, expect=4)
-    rows = (tmp_path / "mine" / "steps" / "00" / "metrics.jsonl").read_text().splitlines()
+    rows = (tmp_path / "mine" / "iterations" / "00" / "metrics.jsonl").read_text().splitlines()
     assert [json.loads(row)["update"] for row in rows] == list(range(1, 31))

@@ -1,4 +1,4 @@
-"""Requirements: what is refused, what is measured, and what is missing."""
+"""Requirements: numbers that are refused, measures of a judgement, and misses."""
 
 import dataclasses
 import math
@@ -10,9 +10,9 @@ from flytune.errors import BadInput
 from flytune.evaluation.fly import fly
 from flytune.evaluation.judge import judge
 from flytune.task.task import load_task
-from flytune.tuning.requirement import Measured, make_requirement
+from flytune.tuning.requirement import ResponseSummary, make_requirement
 
-GOOD = Measured(settling_time=2.5, overshoot=0.0, error=0.001, settled=1.0, kept=1.0)
+GOOD = ResponseSummary(settling_time=2.5, overshoot=0.0, error=0.001, settled=1.0, constraints_satisfied=1.0)
 
 
 def but(**changes):
@@ -51,7 +51,7 @@ def test_units_of_the_command_line_become_those_of_the_judge():
 
 
 @pytest.mark.parametrize(
-    ("measured", "missing"),
+    ("response", "missing"),
     [
         (GOOD, {}),
         (but(settling_time=2.76), {"settling_time"}),
@@ -61,11 +61,11 @@ def test_units_of_the_command_line_become_those_of_the_judge():
         (but(overshoot=0.051), {"overshoot"}),
         (but(error=0.0101), {"error"}),
         (but(settled=0.985), {"settled"}),
-        (but(kept=0.98), {"kept"}),
+        (but(constraints_satisfied=0.98), {"constraints_satisfied"}),
     ],
 )
-def test_what_is_missing_of_a_target(measured, missing):
-    assert set(make_requirement(2.5).misses(measured)) == set(missing)
+def test_what_is_missing_of_a_target(response, missing):
+    assert set(make_requirement(2.5).misses(response)) == set(missing)
 
 
 def test_an_upper_bound_has_no_lower_side_and_no_tolerance():
@@ -79,16 +79,16 @@ def test_the_tuning_starts_are_asked_for_more_of_everything_but_the_shares():
     wanted = make_requirement(2.5)
     barely = but(settling_time=2.7, overshoot=0.045, error=0.009, settled=0.99)
     assert not wanted.misses(barely)
-    assert set(wanted.narrowed().misses(barely)) == {"settling_time", "overshoot", "error"}
-    early = make_requirement(2.5, at_most=True).narrowed()
-    assert early.latest() == pytest.approx(2.375)
-    assert early.aim() < early.latest()
+    assert set(wanted.tightened().misses(barely)) == {"settling_time", "overshoot", "error"}
+    early = make_requirement(2.5, at_most=True).tightened()
+    assert early.maximum_settling_time() == pytest.approx(2.375)
+    assert early.aim() < early.maximum_settling_time()
 
 
 def test_a_miss_is_finite_and_of_the_right_sign_whatever_was_measured():
     for at_most in (False, True):
-        wanted = make_requirement(3.4, at_most=at_most).narrowed()
-        for time in (0.0, 1.0, wanted.aim(), wanted.latest() + 1e-9, 50.0, math.inf):
+        wanted = make_requirement(3.4, at_most=at_most).tightened()
+        for time in (0.0, 1.0, wanted.aim(), wanted.maximum_settling_time() + 1e-9, 50.0, math.inf):
             miss = wanted.misses(but(settling_time=time, error=math.inf, overshoot=math.inf)).get("settling_time")
             assert miss is None or (math.isfinite(miss) and miss * (time - wanted.aim()) > 0)
     assert set(make_requirement(2).misses(but(settling_time=0.0))) == {"settling_time"}
@@ -124,8 +124,8 @@ def test_only_bounds_the_user_has_set_have_to_be_kept(pid_flights):
     broken[:10] = True
     judged = dataclasses.replace(judged, violated={**judged.violated, "speed": broken})
     wanted = make_requirement(3)
-    assert wanted.measure(judged).kept == 1
-    assert wanted.measure(judged, fixed=("speed",)).kept == pytest.approx(0.75)
+    assert wanted.measure(judged).constraints_satisfied == 1
+    assert wanted.measure(judged, constraints=("speed",)).constraints_satisfied == pytest.approx(0.75)
 
 
 def test_trials_of_two_judgements_count_as_one_set(pid_flights):

@@ -1,4 +1,4 @@
-"""The rules: all are readable, none is sillier than its condition, and a user's own join them."""
+"""The rules: every one can be used, impossible ones are refused, and those of a user join them."""
 
 import dataclasses
 import re
@@ -8,12 +8,12 @@ import pytest
 from flytune.config import document
 from flytune.errors import BadInput
 from flytune.task.task import load_task
-from flytune.tuning.rules import conditions, field_of, is_fixed, load_rules, moved, rules_table
+from flytune.tuning.rules import apply_rule, is_fixed, load_rules, number_at, rules_table, symptoms
 
 RULES = load_rules()
 
 
-def test_every_heuristic_of_the_paper_is_in_the_book():
+def test_every_heuristic_of_the_paper_is_among_the_rules():
     found = set(re.findall(r"H\d+", " ".join(rule.source for rule in RULES)))
     assert found == {f"H{number}" for number in range(1, 12)}
 
@@ -21,7 +21,7 @@ def test_every_heuristic_of_the_paper_is_in_the_book():
 @pytest.mark.parametrize("rule", [rule for rule in RULES if not rule.advice], ids=lambda rule: rule.name)
 def test_a_rule_edits_a_number_of_a_known_task_that_may_be_moved_to_both_ends(rule):
     names = ("baseline-refined", "acrobatic-refined", "inspection-refined")
-    having = [name for name in names if field_of(document.plain(load_task(name)), rule.field) is not None]
+    having = [name for name in names if number_at(document.plain(load_task(name)), rule.field) is not None]
     assert having
     for name in having:
         for end in rule.range:
@@ -43,7 +43,7 @@ def test_a_rule_edits_a_number_of_a_known_task_that_may_be_moved_to_both_ends(ru
         ('name = "a"\nadvice = """b\nc"""', "holds a line break"),
     ],
 )
-def test_a_rule_that_makes_no_sense_is_refused_with_its_number(tmp_path, rule, said):
+def test_a_rule_that_cannot_be_used_is_refused_with_its_number(tmp_path, rule, said):
     path = tmp_path / "mine.toml"
     path.write_text(f"[[rule]]\n{rule}\n")
     with pytest.raises(BadInput, match=rf"mine\.toml: rule 1.*{said}"):
@@ -67,16 +67,16 @@ def test_rules_of_the_user_replace_those_of_the_same_name_and_join_the_others(tm
     assert "mine" in rules_table(list(rules.values()))
 
 
-def test_an_edit_stays_within_its_step_and_its_range():
+def test_an_edit_stays_within_its_largest_factor_and_its_range():
     rule = dataclasses.replace(RULES[0], largest=2.0, range=(0.1, 3.0))
-    assert moved(rule, 1.0, 1.5) == 1.5
-    assert moved(rule, 1.0, 5.0) == 2.0
-    assert moved(rule, 2.0, 2.0) == 3.0
-    assert moved(rule, 0.15, 0.1) == 0.1
+    assert apply_rule(rule, 1.0, 1.5) == 1.5
+    assert apply_rule(rule, 1.0, 5.0) == 2.0
+    assert apply_rule(rule, 2.0, 2.0) == 3.0
+    assert apply_rule(rule, 0.15, 0.1) == 0.1
 
 
 def test_trials_that_do_not_settle_come_first():
-    assert conditions({"error": 1.0, "settling_time": -0.3, "settled": -0.2}) == ["unsettled", "too fast", "inexact"]
+    assert symptoms({"error": 1.0, "settling_time": -0.3, "settled": -0.2}) == ["unsettled", "too fast", "inaccurate"]
 
 
 def test_a_field_is_fixed_where_it_or_a_table_above_it_was_set():
@@ -85,10 +85,10 @@ def test_a_field_is_fixed_where_it_or_a_table_above_it_was_set():
     assert not is_fixed("termination.speed.bound", ("termination.spee", "reward.velocity.weight"))
 
 
-def test_the_table_says_of_every_rule_when_what_how_far_and_unless():
+def test_the_table_shows_symptom_edit_size_and_reason_of_every_rule():
     lines = rules_table(RULES).splitlines()
     line = next(line for line in lines if line.startswith("H6 faster"))
     for words in ("too slow", "reward.velocity.weight down", "x 2", "0.01 to 1", "settling time ~ field^0.15",
-                  "overshoot missed", "makes haste cost less (paper H6)"):  # fmt: skip
+                  "overshoot missed", "penalises speed less (paper H6)"):  # fmt: skip
         assert words in line
     assert next(line for line in lines if line.startswith("H10 split: ")).endswith("(paper H10)")

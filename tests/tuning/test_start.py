@@ -1,10 +1,11 @@
-"""Where a tuning begins: the known policy that settles nearest, on a task with the user's fields."""
+"""The start of a tuning: the known policy that settles nearest, on a task with the user's fields."""
 
 import math
 
 import pytest
 
 from flytune.errors import BadInput
+from flytune.task.task import load_task
 from flytune.tuning.requirement import make_requirement
 from flytune.tuning.start import find_start
 
@@ -34,22 +35,23 @@ def test_a_field_that_no_known_task_has_is_refused():
         find_start(make_requirement(3), None, {"reward.velocity.wieght": 0.2}, "apg")
 
 
-def test_a_task_nobody_flies_is_to_be_learned_from_nothing():
+def test_a_task_without_a_known_policy_is_trained_from_new_weights():
     start = find_start(make_requirement(3), "baseline", {}, "apg")
     assert (start.name, start.files) == ("baseline", None)
-    # learned with the task's own settings, gone on from with the tuner's
+    # the first training uses the settings of the task, a warm start those of the tuning
     assert (start.first.apg.updates, start.task.apg.updates) == (300, 200)
 
 
-def test_a_known_policy_with_other_layers_than_the_user_wants_is_not_gone_on_from():
+def test_a_known_policy_with_other_layers_than_the_user_wants_is_not_used():
     assert find_start(make_requirement(3), "baseline-refined", {"apg.hidden": [32, 32]}, "apg").files is None
 
 
-def test_ppo_begins_with_a_policy_of_its_own():
+def test_ppo_starts_from_a_policy_that_ppo_has_trained():
     start = find_start(make_requirement(4), None, {}, "ppo")
     assert start.files is not None
     assert start.files[0].stem.endswith("@ppo")
-    assert "apg.updates" not in start.task.sources or start.task.apg.updates > 200
+    # the settings of the other trainer stay as they are
+    assert start.task.apg == load_task(start.name).apg
 
 
 def test_episodes_grow_by_doubling_and_what_the_user_has_set_stays():

@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 from cyclopts import Parameter
 
 from flytune.cli.options import Edits, EveryTaskTrainerName, Flag, Folder, Real, Whole, assignments
-from flytune.errors import BadInput, Unmet
+from flytune.errors import Unmet
 from flytune.training.trainer import DEFAULT_TRAINER, trainer_names
 
 
@@ -64,25 +64,17 @@ TuneTask = Annotated[
 
 def tune(task: TuneTask = None, /, *, options: TuneOptions) -> None:
     """Ask for a step response: the task is edited by rules and trained, until the controller flies like that."""
-    from flytune.report.tuning import write_tuning
     from flytune.training.progress import show_progress
-    from flytune.tuning.requirement import make_requirement
-    from flytune.tuning.rules import load_rules
-    from flytune.tuning.search import new_tuning_directory, tune
+    from flytune.tuning.tune import tune
 
-    requirement = make_requirement(
-        options.settling_time, options.overshoot, options.error, at_most=options.at_most,
-        tolerance=options.tolerance, axis=options.axis, percentile=options.percentile,
-    )  # fmt: skip
-    rules = load_rules(options.rules)
-    if options.resume and options.out is None:
-        raise BadInput("resume: needs --out DIR, the tuning to continue.")
-    out = options.out or new_tuning_directory(requirement)
     with show_progress() as on_progress:
-        result = tune(requirement, rules, out, task=task, edits=assignments(options.edits), seed=options.seed,
-                      trainer=options.trainer, most_steps=options.steps, resume=options.resume,
-                      tell=lambda line: print(line, flush=True), on_progress=on_progress)  # fmt: skip
-    write_tuning(out / "report.html", result.to_dict())
-    print(out)
+        result = tune(
+            options.settling_time, overshoot=options.overshoot, error=options.error, axis=options.axis,
+            percentile=options.percentile, at_most=options.at_most, tolerance=options.tolerance, task=task,
+            edits=assignments(options.edits), rules=options.rules, trainer=options.trainer, seed=options.seed,
+            most_iterations=options.steps, out=options.out, resume=options.resume,
+            on_message=lambda line: print(line, flush=True), on_progress=on_progress,
+        )  # fmt: skip
+    print(result.directory)
     if not result.met:
         raise Unmet(result.why())

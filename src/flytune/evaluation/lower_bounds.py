@@ -1,4 +1,4 @@
-"""Physical lower bounds: what no controller can beat from a given start, and how near a flight came. NumPy only."""
+"""Physical lower bounds on the settling time, and how near a flight came to them. NumPy only."""
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -6,18 +6,45 @@ from jaxtyping import Bool, Float
 from flytune.evaluation.metrics import MINIMUM_STAY, POSITION_BAND
 
 
-def settling_time_bound(distance: Float[np.ndarray, "N"], speed_bound: float | None) -> Float[np.ndarray, "N"]:
+def settling_time_bound(
+    distance: Float[np.ndarray, "N"], speed_bound: float | None, band: float = POSITION_BAND
+) -> Float[np.ndarray, "N"]:
     """Least time in s to bring a trial that starts `distance` m from the target into the band, within the speed bound.
 
-        bound = max(0, |e_p(0)| - 0.02 m) / speed_bound
+        bound = max(0, |e_p(0)| - band) / speed_bound
 
-    0 everywhere without a speed bound (m/s): then nothing is known but that time does not run backwards.
+    0 everywhere without a speed bound (m/s): then nothing is known but that time does not run backwards. With distance
+    and band in rad and a body rate bound in rad/s it is the bound for the yaw.
 
     Source: docs, definitions; paper R14 for the speed bounds.
     """
     if speed_bound is None:
         return np.zeros_like(distance)
-    return np.maximum(0.0, distance - POSITION_BAND) / speed_bound
+    return np.maximum(0.0, distance - band) / speed_bound
+
+
+def thrust_bound(
+    distance: Float[np.ndarray, "N"],
+    forwards: Float[np.ndarray, "N"] | float,
+    backwards: Float[np.ndarray, "N"] | float,
+) -> Float[np.ndarray, "N"]:
+    """Least time in s that any controller takes from rest into the band around the target, to stay there.
+
+    The way to the band, D = distance - 0.02 m, is flown with the largest acceleration `forwards` (m/s^2) and then with
+    the largest deceleration `backwards` (m/s^2), down to the speed that can still be lost within the width of the band:
+
+        v = sqrt(2 backwards 0.04),  vp^2 / (2 forwards) + (vp^2 - v^2) / (2 backwards) = D,
+        t = vp / forwards + (vp - v) / backwards
+
+    Attitude and motors are assumed to change at once, so that a real controller always takes longer.
+    """
+    way = np.maximum(0.0, distance - POSITION_BAND)
+    arrival = np.sqrt(2 * np.asarray(backwards) * 2 * POSITION_BAND)
+    peak = np.sqrt(
+        (way + arrival**2 / (2 * backwards)) / (1 / (2 * np.asarray(forwards)) + 1 / (2 * np.asarray(backwards)))
+    )
+    brakes = peak > arrival
+    return np.where(brakes, peak / forwards + (peak - arrival) / backwards, np.sqrt(2 * way / forwards))
 
 
 def infeasible(bound: Float[np.ndarray, "N"], duration: float, margins: dict[str, np.ndarray]) -> Bool[np.ndarray, "N"]:

@@ -1,4 +1,4 @@
-"""The effect map as a drawing and as tables, beside what the paper claims of each parameter (H1 to H11)."""
+"""The sensitivities as a drawing and as tables, beside the claims of the paper about each parameter (H1 to H11)."""
 
 import math
 from pathlib import Path
@@ -8,7 +8,7 @@ import matplotlib as mpl
 from matplotlib.figure import Figure
 
 from flytune.report.style import HAIRLINE, QUIET, TRIALS
-from flytune.tuning.sensitivity import Effects, Point
+from flytune.tuning.sensitivity import Point, Sensitivities
 
 MEASURES = (
     ("settling_time", "settling time [s]", 1.0),
@@ -16,7 +16,7 @@ MEASURES = (
     ("error", "error [mm]", 1e3),
 )
 
-# item, claim, parameter, measure, which way the measure is to go where the parameter is raised, of what
+# item, claim, parameter, measure, claimed direction of the measure where the parameter is raised, axis
 CLAIMS = (
     ("H1, H2", "survival up: bolder, faster", "reward.survival.reward", "settling_time", "down", "position"),
     ("H3", "horizontal delta up: faster", "reward.horizontal.wide", "settling_time", "down", "position"),
@@ -33,21 +33,21 @@ CLAIMS = (
 )
 
 
-def heuristics_tables(effects: Effects) -> str:
-    """Verdict per claim, then one table per parameter, as Markdown."""
+def heuristics_tables(sensitivities: Sensitivities) -> str:
+    """The outcome of each claim, then one table per parameter, as Markdown."""
     rows = []
     for item, claim, parameter, measure, direction, axis in CLAIMS:
-        points = effects.parameters[parameter].points
-        ends = [_said(measure, point.middle(measure, axis)) for point in (points[0], points[-1])]
-        verdict = effects.verdict(parameter, measure, direction, axis)  # pyright: ignore[reportArgumentType]
+        points = sensitivities.parameters[parameter].points
+        ends = [_said(measure, point.median(measure, axis)) for point in (points[0], points[-1])]
+        outcome = sensitivities.check_claim(parameter, measure, direction, axis)  # pyright: ignore[reportArgumentType]
         span = f"{points[0].value:g} to {points[-1].value:g}"
-        rows.append((item, claim, f"`{parameter}` {span}", f"{ends[0]} to {ends[1]}", f"**{verdict}**"))
+        rows.append((item, claim, f"`{parameter}` {span}", f"{ends[0]} to {ends[1]}", f"**{outcome}**"))
     parts = [
         "## The paper's claims",
-        _table(("item", "claim", "parameter", "measured", "verdict"), rows),
+        _table(("item", "claim", "parameter", "measured", "outcome"), rows),
         "## Every parameter",
     ]
-    for parameter, curve in effects.parameters.items():
+    for parameter, curve in sensitivities.parameters.items():
         parts.append(f"### `{parameter}`, {curve.baseline:g} in the baseline")
         parts.append(
             _table(
@@ -58,12 +58,12 @@ def heuristics_tables(effects: Effects) -> str:
     return "\n\n".join(parts) + "\n"
 
 
-def draw_effects(path: Path, effects: Effects) -> None:
-    """Write the map as an SVG: a row per measure, a column per parameter, the median over seeds and the range of them."""
+def draw_sensitivities(path: Path, sensitivities: Sensitivities) -> None:
+    """Write the sensitivities as an SVG: one row per measure, one column per parameter, median and range of the seeds."""
     with mpl.rc_context(
         {"svg.fonttype": "none", "svg.hashsalt": "flytune", "font.size": 8, "font.family": "sans-serif"}
     ):
-        parameters = list(effects.parameters.items())
+        parameters = list(sensitivities.parameters.items())
         figure = Figure(figsize=(2.1 * len(parameters), 6.0), layout="constrained")
         grid: Any = figure.subplots(len(MEASURES), len(parameters), sharey="row", squeeze=False)
         for column, (parameter, curve) in enumerate(parameters):
@@ -72,7 +72,7 @@ def draw_effects(path: Path, effects: Effects) -> None:
                 panel = grid[row][column]
                 values = [point.value for point in points]
                 numbers = [[scale * n if math.isfinite(n) else math.nan for n in p.numbers(measure)] for p in points]
-                middles = [scale * p.middle(measure) if math.isfinite(p.middle(measure)) else math.nan for p in points]
+                middles = [scale * p.median(measure) if math.isfinite(p.median(measure)) else math.nan for p in points]
                 panel.fill_between(
                     values, [min(n) for n in numbers], [max(n) for n in numbers], color=TRIALS[row], alpha=0.18, lw=0
                 )
@@ -91,16 +91,16 @@ def draw_effects(path: Path, effects: Effects) -> None:
 
 
 def _row(point: Point, baseline: float) -> tuple[str, ...]:
-    settled = [flown.settled for flown in point.seeds]
+    settled = [result.settled for result in point.seeds]
     crossed = [
-        sum(n for name, n in flown.details.get("violations", {}).items() if "speed" in name) for flown in point.seeds
+        sum(n for name, n in result.details.get("violations", {}).items() if "speed" in name) for result in point.seeds
     ]
     value = f"**{point.value:g}**" if point.value == baseline else f"{point.value:g}"
     cells = []
     for measure, _, scale in MEASURES:
         numbers = point.numbers(measure)
         ends = [f"{scale * n:.3g}" if math.isfinite(n) else "-" for n in (min(numbers), max(numbers))]
-        middle = point.middle(measure)
+        middle = point.median(measure)
         cells.append(
             f"{scale * middle:.3g} ({ends[0]} to {ends[1]})" if math.isfinite(middle) else f"- ({ends[0]} to {ends[1]})"
         )

@@ -1,68 +1,103 @@
-"""What a tuning is made of: edits of the task, and the policies that came of them."""
+"""Iterations of a tuning (an edit, a training with it, the response of the policy), and their validations."""
 
 import dataclasses
-from collections.abc import Mapping
+import math
+from collections.abc import Mapping, Sequence
 from typing import Any
 
-from flytune.tuning.requirement import Measured
-from flytune.tuning.rules import CONDITIONS
+from flytune.tuning.requirement import ResponseSummary
+from flytune.tuning.rules import SYMPTOMS
 
-HALF_WAY = "back half-way"  # instead of a rule's name: the last edit went too far
+HALF_WAY = "half-way back"  # instead of a rule's name: the last edit was too large
+SAME = 0.01  # two values of a field that differ by a smaller share count as the same
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Edit:
-    """One change of one field, and what it is for."""
+    """One change of one field of the task, and the reason for it."""
 
     rule: str
     source: str
-    says: str
-    condition: str
+    reason: str
+    symptom: str
     field: str
     before: float
     after: float
     unit: str  # of the field, empty where it has none
-    expects: float | None  # of the rule's measure; None where no number can be promised
-    slope: float  # d log(measure) / d log(field) that is counted on
-    known_from: str  # flown, between, map or rule
-    ends: tuple[float, float] | None  # values of the field that the slope was measured between
-    gain: float  # share of what is missing of the measure that the edit promises, 1 at most
-    second: "Edit | None" = None  # of another field, the next best
+    expected: float | None  # the measure after the edit; None where it cannot be predicted
+    slope: float  # d log(measure) / d log(field) that the prediction uses
+    known_from: str  # iterations, interpolation, sensitivity or rule
+    between: tuple[float, float] | None  # values of the field that the slope was measured between
+    gain: float  # share of the miss that the edit is predicted to remove, 1 at most
+    next_best: "Edit | None" = None  # the best edit of another field
 
     @property
     def measure(self) -> str:
-        """What it is to change."""
-        return CONDITIONS[self.condition][0]
+        """The measure that the edit is to change."""
+        return SYMPTOMS[self.symptom][0]
+
+    @classmethod
+    def from_dict(cls, data: dict[str, Any]) -> "Edit":
+        """The edit that `dataclasses.asdict` has written."""
+        between = tuple(data["between"]) if data["between"] else None
+        next_best = cls.from_dict(data["next_best"]) if data["next_best"] else None
+        return cls(**{**data, "between": between, "next_best": next_best})
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Step:
-    """One policy of the loop: the edits it was trained with, and how it flies."""
+class Iteration:
+    """One policy of a tuning: the edits it was trained with, and its response."""
 
     number: int
-    values: Mapping[str, float]  # field -> value, of every edit so far
-    reasons: Mapping[str, str]  # field -> why
-    edit: Edit | None  # the last of them; None for the policy the loop began with
-    origin: int | None  # the number of the step that was edited
-    measured: Measured
-    looks: int  # sets of starts it was measured on
-    seconds: float  # of training
-    diverged: str = ""  # what became infinite where; such a step has no policy
+    values: Mapping[str, float]  # field -> value, of all edits so far
+    reasons: Mapping[str, str]  # field -> reason
+    edit: Edit | None  # the last edit; None for the first policy
+    parent: int | None  # number of the iteration that was edited
+    response: ResponseSummary
+    trials: int  # trials of the training set when the response was measured
+    seconds: float  # duration of the training
+    diverged: str = ""  # which number became infinite, and where; such an iteration has no policy
 
     def to_dict(self) -> dict[str, Any]:
         """Plain values."""
-        return dataclasses.asdict(self) | {"measured": self.measured.to_dict()}
+        return dataclasses.asdict(self) | {"response": self.response.to_dict()}
 
     @classmethod
-    def from_dict(cls, data: dict[str, Any]) -> "Step":
-        """The inverse of `to_dict`."""
-        edit = read_edit(data["edit"])
-        return cls(**{**data, "edit": edit, "measured": Measured.from_dict(data["measured"])})
+    def from_dict(cls, data: dict[str, Any]) -> "Iteration":
+        """The iteration that `to_dict` has written."""
+        edit = Edit.from_dict(data["edit"]) if data["edit"] else None
+        return cls(**{**data, "edit": edit, "response": ResponseSummary.from_dict(data["response"])})
 
 
-def read_edit(data: dict[str, Any] | None) -> Edit | None:
-    """An edit from its plain values, None from None."""
-    if not data:
-        return None
-    ends = tuple(data["ends"]) if data["ends"] else None
-    return Edit(**{**data, "ends": ends, "second": read_edit(data["second"])})
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Validation:
+    """The result of an iteration on a validation set: initial conditions that the tuning has not used before."""
+
+    iteration: int
+    seed: int  # of the validation set
+    judgement: dict[str, Any]  # as `evaluate --json` prints it
+    misses: dict[str, float]  # as `Requirement.misses` has them; empty where the requirement is met
+
+
+def value_in(iteration: Iteration, field: str, iterations: Sequence[Iteration]) -> float | None:
+    """The field's value in an iteration; None where no iteration has edited the field."""
+    if field in iteration.values:
+        return iteration.values[field]
+    return next((each.edit.before for each in iterations if each.edit and each.edit.field == field), None)
+
+
+def variants(iteration: Iteration, field: str, iterations: Sequence[Iteration]) -> list[tuple[Iteration, float]]:
+    """The iterations whose values equal those of `iteration` in all fields but this one, each with its value of it."""
+    found = []
+    for other in iterations:
+        value = value_in(other, field, iterations)
+        names = (set(iteration.values) | set(other.values)) - {field}
+        if value is not None and all(iteration.values.get(name) == other.values.get(name) for name in names):
+            found.append((other, value))
+    return found
+
+
+def already_tried(iteration: Iteration, field: str, value: float, iterations: Sequence[Iteration]) -> Iteration | None:
+    """The first iteration that has this value of the field and otherwise the values of `iteration`."""
+    same = (other for other, there in variants(iteration, field, iterations) if abs(math.log(there / value)) < SAME)
+    return next(same, None)

@@ -1,85 +1,126 @@
-"""What a tuning says: a response, an edit and its reason, what an edit did, what is missing."""
+"""Messages of a tuning: a response, an edit and its reason, the result of an edit, and what misses the requirement."""
 
 import math
+from collections.abc import Mapping, Sequence
+from typing import Any
 
-from flytune.tuning.iteration import HALF_WAY, Edit, Step
-from flytune.tuning.requirement import FAR, Measured, Requirement
+from flytune.tuning.iteration import HALF_WAY, Edit, Iteration
+from flytune.tuning.requirement import LARGEST_MISS, Requirement, ResponseSummary
+
+
+def line(topic: str, text: str) -> str:
+    """One line of the log: the topic in a column of its own."""
+    return f"{topic:<14}{text}"
 
 
 def describe(
-    measured: Measured, requirement: Requirement, notes: dict[str, str] | None = None, *, bounds: bool = False
+    response: ResponseSummary, requirement: Requirement, notes: Mapping[str, str] | None = None, *, bounds: bool = False
 ) -> str:
-    """A measured response in words; `notes` says more of a measure, `bounds` that the user has set some."""
-    settles = math.isfinite(measured.settling_time)
-    said = {name: said_of(name, getattr(measured, name), requirement) for name in vars(measured)}
-    words = {
-        "settling_time": f"settles in {said['settling_time']}" if settles else "does not settle",
-        "overshoot": f"overshoot {said['overshoot']}",
-        "error": f"error {said['error']}",
-        "settled": f"{said['settled']} settled",
-        "kept": f"your bounds kept in {said['kept']}",
+    """A response in one line.
+
+    Args:
+        response: the response.
+        requirement: the requirement, for the units.
+        notes: measure -> a note in brackets.
+        bounds: whether the user has set constraints, which are then always mentioned.
+    """
+    numbers = {name: with_unit(name, getattr(response, name), requirement) for name in vars(response)}
+    settles = math.isfinite(response.settling_time)
+    texts = {
+        "settling_time": f"settles in {numbers['settling_time']}" if settles else "does not settle",
+        "overshoot": f"overshoot {numbers['overshoot']}",
+        "error": f"error {numbers['error']}",
+        "settled": f"{numbers['settled']} settled",
+        "constraints_satisfied": f"your constraints are satisfied in {numbers['constraints_satisfied']}",
     }
-    shown = [name for name in words if name != "kept" or bounds or measured.kept < 1]
-    return ", ".join(words[name] + (notes or {}).get(name, "") for name in shown)
+    shown = [name for name in texts if name != "constraints_satisfied" or bounds or response.constraints_satisfied < 1]
+    return ", ".join(texts[name] + (notes or {}).get(name, "") for name in shown)
 
 
-def describe_targets(requirement: Requirement, trials: int, duration: float) -> str:
-    """What is asked on the tuning starts, and what that means."""
-    low = (1 - requirement.tolerance) * requirement.settling_time
-    time = (
-        f"at most {requirement.latest():.2f} s" if requirement.at_most else f"{low:.2f} to {requirement.latest():.2f} s"
-    )
-    band = "3.6 deg" if requirement.axis == "yaw" else "2 cm"
+def describe_target(target: Requirement, trials: int, duration: float) -> str:
+    """The requirement on the training set, and when a trial counts as settled."""
+    lowest, highest = (1 - target.tolerance) * target.settling_time, target.maximum_settling_time()
+    time = f"at most {highest:.2f} s" if target.at_most else f"{lowest:.2f} to {highest:.2f} s"
+    band = "3.6 deg" if target.axis == "yaw" else "2 cm"
     return (
-        f"{time}, overshoot at most {said_of('overshoot', requirement.overshoot, requirement)}, error at most "
-        f"{said_of('error', requirement.error, requirement)} in {trials} trials of {duration:g} s; settled is "
-        f"within {band} to the end, a trial that does not settle counts as infinitely slow"
+        f"{trials} trials of {duration:g} s; required there: {time}, overshoot at most "
+        f"{with_unit('overshoot', target.overshoot, target)}, error at most {with_unit('error', target.error, target)}. "
+        f"A trial has settled if it stays within {band} until its end; a trial that has not counts as infinitely slow"
     )
+
+
+def describe_fixed(edits: Mapping[str, Any], requirement: Requirement, constraints: Sequence[str]) -> str:
+    """The fields that the user has set, and the constraints among them."""
+    fields = ", ".join(f"{path} = {value}" for path, value in edits.items())
+    share = f"{100 * requirement.settled:g} % of the trials"
+    return f"by you: {fields}" + (f"; required in {share}: {', '.join(constraints)}" if constraints else "")
+
+
+def describe_start(name: str, times: Mapping[str, float], duration: float) -> str:
+    """The settling times of the known policies, and the one that the tuning starts with."""
+    never = f"does not settle within {duration:g} s"
+    known = ", ".join(f"{task} {f'{time:.2f} s' if math.isfinite(time) else never}" for task, time in times.items())
+    nearest = f"; the tuning starts with {name}, which is nearest as a ratio" if len(times) > 1 else ""
+    return f"settling times of the known policies: {known}{nearest}"
 
 
 def describe_edit(edit: Edit, requirement: Requirement) -> str:
-    """An edit in one line: what is missing, the edit, what is expected and why so, the rule, and the next best edit."""
-    condition = "too far" if edit.rule == HALF_WAY else edit.condition
-    known = f" ({_known(edit)})" if _known(edit) else ""
+    """An edit in one line: the symptom, the edit, the prediction and its origin, the rule, and the next best edit."""
+    symptom = "the last edit was too large" if edit.rule == HALF_WAY else edit.symptom
+    origin = f" ({_origin(edit)})" if _origin(edit) else ""
     source = "" if edit.rule.startswith(f"{edit.source.removeprefix('paper ')} ") else f" ({edit.source})"
-    second = ""
-    if edit.second is not None and edit.second.expects is not None:
-        second = f". Next best: {_change(edit.second, requirement)} ({edit.second.rule})"
-    return f"{condition}: {_change(edit, requirement)}{known}. {edit.rule}: {edit.says}{source}{second}"
+    next_best = ""
+    if edit.next_best is not None and edit.next_best.expected is not None:
+        next_best = f". Next best: {_change(edit.next_best, requirement)} ({edit.next_best.rule})"
+    return f"{symptom}: {_change(edit, requirement)}{origin}. {edit.rule}: {edit.reason}{source}{next_best}"
 
 
-def describe_step(step: Step, before: Measured | None, requirement: Requirement, *, bounds: bool = False) -> str:
-    """What a step's response is beside what it was and what was expected of its edit, and what is missing."""
-    if step.diverged:
-        return f"diverged: {step.diverged}"
+def describe_iteration(
+    iteration: Iteration, before: ResponseSummary | None, requirement: Requirement, *, bounds: bool = False
+) -> str:
+    """The response of an iteration beside the one before and the expected one, and what misses the requirement.
+
+    Args:
+        iteration: the iteration.
+        before: the response of its parent, None without one.
+        requirement: the requirement on the training set.
+        bounds: whether the user has set constraints.
+    """
+    if iteration.diverged:
+        return f"diverged: {iteration.diverged}"
     notes = {}
-    if step.edit is not None and before is not None:
-        measure = step.edit.measure
-        note = f"was {said_of(measure, getattr(before, measure), requirement)}"
-        if step.edit.expects is not None:
-            note += f", expected {said_of(measure, step.edit.expects, requirement)}"
+    if iteration.edit is not None and before is not None:
+        measure = iteration.edit.measure
+        note = f"was {with_unit(measure, getattr(before, measure), requirement)}"
+        if iteration.edit.expected is not None:
+            note += f", expected {with_unit(measure, iteration.edit.expected, requirement)}"
         notes[measure] = f" ({note})"
-    misses = requirement.misses(step.measured)
-    missing = ", ".join(describe_miss(name, size, requirement) for name, size in misses.items())
     return (
-        f"{describe(step.measured, requirement, notes, bounds=bounds)}; {f'missing: {missing}' if missing else 'met'}"
+        f"{describe(iteration.response, requirement, notes, bounds=bounds)}; "
+        f"{describe_misses(requirement.misses(iteration.response), requirement)}"
     )
 
 
+def describe_misses(misses: Mapping[str, float], requirement: Requirement) -> str:
+    """All misses in words, or that the requirement is met."""
+    texts = [describe_miss(name, size, requirement) for name, size in misses.items()]
+    return f"not met: {', '.join(texts)}" if texts else "met"
+
+
 def describe_miss(measure: str, size: float, requirement: Requirement) -> str:
-    """A miss, as `Requirement.misses` has it, in words."""
+    """One miss, as `Requirement.misses` has it, in words."""
     if measure == "settling_time":
-        side, for_what = ("slow" if size > 0 else "fast"), f"{requirement.settling_time:g} s"
+        side, limit = ("slow" if size > 0 else "fast"), f"{requirement.settling_time:g} s"
         ratio = requirement.aim() * math.exp(size) / requirement.settling_time
-        share = f"{100 * abs(ratio - 1):.0f} %" if abs(size) < FAR else "far"
-        return f"{share} too {side} for {'at most ' if requirement.at_most else ''}{for_what}"
-    if measure in ("settled", "kept"):
-        share = said_of(measure, requirement.settled + size, requirement)
-        return f"only {share} settle" if measure == "settled" else f"only {share} keep the bounds you have set"
-    return f"{measure} above {said_of(measure, getattr(requirement, measure), requirement)}"
+        share = f"{100 * abs(ratio - 1):.0f} %" if abs(size) < LARGEST_MISS else "far"
+        return f"{share} too {side} for {'at most ' if requirement.at_most else ''}{limit}"
+    if measure in ("settled", "constraints_satisfied"):
+        share = with_unit(measure, requirement.settled + size, requirement)
+        return f"only {share} of the trials {'settle' if measure == 'settled' else 'satisfy your constraints'}"
+    return f"{measure} above {with_unit(measure, getattr(requirement, measure), requirement)}"
 
 
-def said_of(measure: str, value: float, requirement: Requirement) -> str:
+def with_unit(measure: str, value: float, requirement: Requirement) -> str:
     """A number of a measure with its unit."""
     if not math.isfinite(value):
         return "never" if measure == "settling_time" else "infinite"
@@ -90,33 +131,34 @@ def said_of(measure: str, value: float, requirement: Requirement) -> str:
     return f"{100 * value:.1f} %"
 
 
-def _named(measure: str) -> str:
-    return measure.replace("_", " ")
-
-
 def _change(edit: Edit, requirement: Requirement) -> str:
-    """What is edited, and what the measure is expected to be afterwards."""
+    """What is edited, and the expected value of the measure."""
     unit = f" {edit.unit}" if edit.unit and "unit(" not in edit.unit else ""
-    expects = ""
-    if edit.expects is not None:
-        expects = f", expects {_named(edit.measure)} {said_of(edit.measure, edit.expects, requirement)}"
-    return f"{edit.field} {edit.before:g} -> {edit.after:g}{unit}{expects}"
+    expected = ""
+    if edit.expected is not None:
+        expected = f", expected {_name(edit.measure)} {with_unit(edit.measure, edit.expected, requirement)}"
+    return f"{edit.field} {edit.before:g} -> {edit.after:g}{unit}{expected}"
 
 
-def _known(edit: Edit) -> str:
-    """Where the size of an edit comes from: the power law it counts on, and what that was measured between."""
+def _origin(edit: Edit) -> str:
+    """How the size of an edit was found: the power law that was used, and where it was measured."""
     if edit.rule == HALF_WAY:
-        return f"half-way back to {edit.before:g}, in logarithms"
-    if edit.expects is None:
-        return "no number can be promised: the rule's largest step"
-    law = f"{_named(edit.measure)} ~ {edit.field.split('.')[-1]}^{edit.slope:.2g}"
-    if edit.ends is None:
-        return f"{law}, the rule's own guess, not measured"
-    low, high = sorted(edit.ends)
+        return f"half-way back to {edit.before:g} on a logarithmic scale"
+    if edit.expected is None:
+        return "the effect cannot be predicted; this is the largest change that the rule allows"
+    law = f"{_name(edit.measure)} ~ {edit.field.split('.')[-1]}^{edit.slope:.2g}"
+    if edit.between is None:
+        return f"{law}, assumed by the rule, not measured"
+    low, high = sorted(edit.between)
     inside = low <= min(edit.before, edit.after) and max(edit.before, edit.after) <= high
-    where = {
-        "flown": f"{law} in the steps at {low:g} and {high:g}",
-        "map": f"{law} between {low:g} and {high:g} of the effect map{'' if inside else ', extrapolated'}",
-        "between": f"false position between the steps at {low:.3g} and {high:.3g}, one too slow and one too fast",
+    texts = {
+        "iterations": f"{law}, from the iterations at {low:g} and {high:g}",
+        "sensitivity": f"{law}, sensitivity measured from {low:g} to {high:g}{'' if inside else ', extrapolated'}",
+        "interpolation": f"interpolated between the iterations at {low:.3g} and {high:.3g}, "
+        "of which one is too slow and one too fast",
     }
-    return where[edit.known_from]
+    return texts[edit.known_from]
+
+
+def _name(measure: str) -> str:
+    return measure.replace("_", " ")

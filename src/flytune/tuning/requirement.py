@@ -1,4 +1,4 @@
-"""What is asked of a response, and how far a measured one is from it."""
+"""The requirement on a response, and how far a measured response is from it."""
 
 import dataclasses
 import math
@@ -13,39 +13,42 @@ from flytune.evaluation.statistics import quantile
 
 AXES = ("position", "x", "y", "z", "yaw")
 LONGEST = 60.0  # s
-FAR = 20.0  # the largest miss there is, also where the measure is infinite
-TUNING_TOLERANCE, TUNING_BOUNDS = 0.5, 0.8  # shares of what is allowed on fresh starts that the tuning starts may take
+LARGEST_MISS = 20.0  # also where the measure is infinite
+TRAINING_TOLERANCE, TRAINING_BOUNDS = (
+    0.5,
+    0.8,
+)  # of what is allowed on a validation set, the share allowed on the training set
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Measured:
-    """What counts of a judged response: one number per measure, +inf where too few trials have one.
+class ResponseSummary:
+    """One number per measure of a judged response, +inf where too few trials have one.
 
-    Source: docs, definitions.
+    Source: docs/concepts/definitions.md.
     """
 
     settling_time: float  # s, at the percentile asked for
     overshoot: float  # fraction of the step, median
     error: float  # m, rad for yaw; median
     settled: float  # share of the trials
-    kept: float  # share of the trials that cross none of the bounds the user has fixed
+    constraints_satisfied: float  # share of the feasible trials that violate no constraint of the user
 
     def to_dict(self) -> dict[str, float | None]:
         """Plain numbers, None where infinite."""
         return {name: v if math.isfinite(v) else None for name, v in dataclasses.asdict(self).items()}
 
     @classmethod
-    def from_dict(cls, numbers: dict[str, Any]) -> "Measured":
-        """The inverse of `to_dict`."""
+    def from_dict(cls, numbers: dict[str, Any]) -> "ResponseSummary":
+        """The summary that `to_dict` has written."""
         return cls(**{name: math.inf if value is None else value for name, value in numbers.items()})
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Requirement:
-    """The response that is wanted, of one axis or of the position."""
+    """The wanted response of one axis or of the position."""
 
     settling_time: float  # s
-    tolerance: float = 0.1  # share of the settling time it may be off by; only above it where `at_most`
+    tolerance: float = 0.1  # allowed deviation, as a share of the settling time
     at_most: bool = False  # the settling time is an upper bound, not a target
     overshoot: float = 0.05  # at most, fraction of the step, median of the trials
     error: float = 0.01  # at most, m (rad for yaw), median of the trials
@@ -53,28 +56,30 @@ class Requirement:
     axis: str = "position"
     percentile: float = 50.0  # of the trials, for the settling time
 
-    def latest(self) -> float:
+    def maximum_settling_time(self) -> float:
         """The longest settling time in s that still meets the requirement."""
         return self.settling_time * (1.0 if self.at_most else 1.0 + self.tolerance)
 
-    def narrowed(self) -> "Requirement":
-        """What is asked on the tuning starts, so that fresh ones rarely disappoint: half of the tolerance, 80 % of the
-        bounds; `settled` as it is."""
-        tolerance = TUNING_TOLERANCE * self.tolerance
+    def tightened(self) -> "Requirement":
+        """The requirement on the training set: half of the tolerance and 80 % of the bounds.
+
+        A policy that meets it usually meets the requirement itself on other initial conditions too.
+        """
+        tolerance = TRAINING_TOLERANCE * self.tolerance
         return dataclasses.replace(
             self,
             settling_time=self.settling_time * (1.0 - tolerance if self.at_most else 1.0),
             tolerance=tolerance,
-            overshoot=TUNING_BOUNDS * self.overshoot,
-            error=TUNING_BOUNDS * self.error,
+            overshoot=TRAINING_BOUNDS * self.overshoot,
+            error=TRAINING_BOUNDS * self.error,
         )
 
     def aim(self) -> float:
-        """The settling time in s to steer for."""
+        """The settling time in s that an edit aims at."""
         return self.settling_time * (1.0 - self.tolerance / 2 if self.at_most else 1.0)
 
-    def measure(self, *judgements: Judgement, fixed: tuple[str, ...] = ()) -> Measured:
-        """The measures of all the trials of one or more judgements; `fixed` names the terminations the user has set."""
+    def measure(self, *judgements: Judgement, constraints: tuple[str, ...] = ()) -> ResponseSummary:
+        """The summary over all trials of one or more judgements; `constraints` names the terminations the user has set."""
 
         def all_of(values: Callable[[Judgement], np.ndarray]) -> np.ndarray:
             return np.concatenate([values(judgement) for judgement in judgements])
@@ -83,47 +88,48 @@ class Requirement:
         stepped = all_of(lambda judged: judged.overshoot[self.axis])
         stepped = stepped[~np.isnan(stepped)]
         feasible = ~all_of(lambda judged: judged.infeasible)
-        crossed = [all_of(lambda judged, name=name: judged.violated[name]) for name in fixed]
+        crossed = [all_of(lambda judged, name=name: judged.violated[name]) for name in constraints]
         broken = np.logical_or.reduce([np.zeros(len(times), bool), *crossed])
-        return Measured(
+        return ResponseSummary(
             settling_time=_quantile(times, self.percentile / 100),
             overshoot=_quantile(stepped, 0.5) if stepped.size else 0.0,
             error=_quantile(all_of(lambda judged: judged.steady_state_error[self.axis]), 0.5),
             settled=float(np.mean(np.isfinite(times))),
-            kept=float(1 - np.mean(broken[feasible])) if feasible.any() else 1.0,
+            constraints_satisfied=float(1 - np.mean(broken[feasible])) if feasible.any() else 1.0,
         )
 
-    def misses(self, measured: Measured) -> dict[str, float]:
-        """What is missing: measure -> by how much, as a logarithm for the settling time and a share for the others.
+    def misses(self, response: ResponseSummary) -> dict[str, float]:
+        """Measure -> by how much it misses its bound; empty where the requirement is met.
 
-        Positive means too much, negative too little; at most `FAR`. Empty where the requirement is met.
+        The logarithm of a ratio for the settling time and the error, a difference of shares for the others. Positive
+        means too much, negative too little. No miss exceeds `LARGEST_MISS`.
         """
         found: dict[str, float] = {}
-        if measured.settled < self.settled:
-            found["settled"] = measured.settled - self.settled
-        if measured.kept < self.settled:
-            found["kept"] = measured.kept - self.settled
-        ratio = measured.settling_time / self.settling_time
-        if measured.settling_time > self.latest() or (not self.at_most and ratio < 1 - self.tolerance):
-            found["settling_time"] = _log(measured.settling_time / self.aim())
-        if measured.overshoot > self.overshoot:
-            found["overshoot"] = min(measured.overshoot - self.overshoot, FAR)
-        if measured.error > self.error:
-            found["error"] = _log(measured.error / self.error)
+        if response.settled < self.settled:
+            found["settled"] = response.settled - self.settled
+        if response.constraints_satisfied < self.settled:
+            found["constraints_satisfied"] = response.constraints_satisfied - self.settled
+        ratio = response.settling_time / self.settling_time
+        if response.settling_time > self.maximum_settling_time() or (not self.at_most and ratio < 1 - self.tolerance):
+            found["settling_time"] = _log(response.settling_time / self.aim())
+        if response.overshoot > self.overshoot:
+            found["overshoot"] = min(response.overshoot - self.overshoot, LARGEST_MISS)
+        if response.error > self.error:
+            found["error"] = _log(response.error / self.error)
         return found
 
-    def parts(self, measured: Measured) -> dict[str, float]:
-        """How far a response is from the requirement, by measure; empty where it is met.
+    def weighted_misses(self, response: ResponseSummary) -> dict[str, float]:
+        """Measure -> its miss in units that can be added; empty where the requirement is met.
 
-        In units that can be added: 1 is a settling time off by a factor of e, a fifth of the trials that do not
-        settle or break a bound, a fifth of the step too much overshoot, or an error too large by a factor of e^2.
+        1 is a settling time off by a factor of e, a fifth of the trials that do not settle or violate a constraint, a
+        fifth of the step too much overshoot, or an error too large by a factor of e^2.
         """
-        sizes = {"settled": 5.0, "kept": 5.0, "settling_time": 1.0, "overshoot": 5.0, "error": 0.5}
-        return {name: sizes[name] * min(abs(size), 10.0) for name, size in self.misses(measured).items()}
+        sizes = {"settled": 5.0, "constraints_satisfied": 5.0, "settling_time": 1.0, "overshoot": 5.0, "error": 0.5}
+        return {name: sizes[name] * min(abs(size), 10.0) for name, size in self.misses(response).items()}
 
-    def distance(self, measured: Measured) -> float:
-        """One number for how far a response is from the requirement, 0 where it is met: to find the best of several."""
-        return sum(self.parts(measured).values())
+    def distance(self, response: ResponseSummary) -> float:
+        """Sum of the weighted misses, 0 where the requirement is met."""
+        return sum(self.weighted_misses(response).values())
 
     def to_dict(self) -> dict[str, Any]:
         """Plain numbers."""
@@ -151,19 +157,19 @@ def make_requirement(
     axis: str = "position",
     percentile: float = 50.0,
 ) -> Requirement:
-    """A requirement from the numbers a user gives.
+    """The requirement in the units of the judge, from numbers in the units of the command line.
 
     Args:
-        settling_time: s.
-        overshoot: at most, percent of the step.
-        error: steady-state error at most, m; deg for yaw. 0.01 m or 1 deg where None.
+        settling_time: wanted settling time in s.
+        overshoot: largest allowed median overshoot in percent of the step.
+        error: largest allowed median steady-state error in m, in deg for yaw; 0.01 m or 1 deg where None.
         at_most: the settling time is an upper bound, not a target.
-        tolerance: percent of the settling time.
+        tolerance: allowed deviation from the settling time in percent.
         axis: position, x, y, z or yaw.
-        percentile: of the trials that the settling time is of.
+        percentile: percentile of the trials at which the settling time is taken.
 
     Raises:
-        BadInput: a number that is not possible, or that seems to be in another unit.
+        BadInput: a number is out of range, or seems to be in another unit.
     """
     if axis not in AXES:
         raise BadInput(f"axis: {axis!r} is not allowed. Allowed: {', '.join(AXES)}.")
@@ -199,7 +205,7 @@ def make_requirement(
 
 
 def _log(ratio: float) -> float:
-    return FAR if math.isinf(ratio) else max(-FAR, min(FAR, math.log(max(ratio, 1e-6))))
+    return LARGEST_MISS if math.isinf(ratio) else max(-LARGEST_MISS, min(LARGEST_MISS, math.log(max(ratio, 1e-6))))
 
 
 def _quantile(values: np.ndarray, share: float) -> float:

@@ -1,48 +1,46 @@
-"""What a tuning came to: its steps, its verdicts on fresh starts, and why it ended."""
+"""The result of a tuning: its iterations, its validations, and why it ended."""
 
 import dataclasses
 from pathlib import Path
 from typing import Any
 
-from flytune.tuning.iteration import Step
-from flytune.tuning.messages import describe_edit, describe_miss, describe_step
+from flytune.tuning.iteration import Iteration, Validation
+from flytune.tuning.messages import describe_edit, describe_iteration, describe_misses
 from flytune.tuning.requirement import Requirement
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Verdict:
-    """A step judged on starts the tuning never saw."""
-
-    step: int
-    seed: int
-    judgement: dict[str, Any]
-    misses: dict[str, float]
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
 class Tuning:
-    """What a tuning came to."""
+    """The result of a tuning."""
 
     requirement: Requirement
-    start: str
-    steps: list[Step]
-    verdicts: list[Verdict]
-    best: int
-    blocked: list[str]  # why no rule could help, where it ended without success
-    directory: Path
-    bounds: tuple[str, ...] = ()  # terminations the user has set
+    start: str  # name of the task it began with
+    iterations: list[Iteration]
+    validations: list[Validation]
+    best: int  # number of the best iteration
+    stopped_because: list[str]  # why no further edit was made, where the requirement is not met
+    directory: Path  # the run directory of the best policy
+    constraints: tuple[str, ...] = ()  # terminations the user has set
 
     @property
     def met(self) -> bool:
-        """Whether the best policy meets the requirement on fresh starts."""
-        return any(verdict.step == self.best and not verdict.misses for verdict in self.verdicts)
+        """Whether the best policy meets the requirement on a validation set."""
+        return any(each.iteration == self.best and not each.misses for each in self.validations)
 
     def why(self) -> str:
-        """What is missing of the best policy, and what stands in the way, in one line."""
-        missing = next((verdict.misses for verdict in reversed(self.verdicts) if verdict.step == self.best), {})
-        said = ", ".join(describe_miss(name, size, self.requirement) for name, size in missing.items())
-        blocked = "; ".join(self.blocked) or "no rule can help"
-        return f"not met: {said} (step {self.best}). {blocked}. Best kept in {self.directory}."
+        """What misses the requirement in the best iteration, and why no further edit was made, in one line."""
+        misses = next((each.misses for each in reversed(self.validations) if each.iteration == self.best), {})
+        reasons = "; ".join(self.stopped_because) or "no rule applies"
+        return (
+            f"{describe_misses(misses, self.requirement)} (iteration {self.best}). The tuning stopped: {reasons}. "
+            f"The best policy is in {self.directory}."
+        )
+
+    def __repr__(self) -> str:
+        outcome = "met" if self.met else "not met"
+        return (
+            f"Tuning({self.requirement}: {outcome}, iteration {self.best} of {len(self.iterations)}, {self.directory})"
+        )
 
     def to_dict(self) -> dict[str, Any]:
         """Plain values for a page.
@@ -50,24 +48,21 @@ class Tuning:
         Keys: `title` (the requirement as a sentence), `requirement` (its numbers), `start` (name of the first task),
         `met`, `best` (number of the best iteration), `why` (why it is not met, else empty), `directory`, `iterations`
         and `validations`. Each iteration has `number`, `parent` (number of the edited iteration, or None), `edit` and
-        `result` (one sentence each), `change` (the edit's own values, or None), `seconds` of training, and `response`
-        (settling_time, overshoot, error, settled, constraints_satisfied; None where infinite). Each validation has
-        `iteration`, `seed`, `judgement` (as `evaluate --json`) and `misses`.
+        `result` (one sentence each), `change` (the fields of `Edit`, or None), `seconds` of training, and `response`
+        (the fields of `ResponseSummary`; None where infinite). Each validation has the fields of `Validation`.
         """
-        iterations, target = [], self.requirement.narrowed()
-        for step in self.steps:
-            before = self.steps[step.origin].measured if step.origin is not None else None
-            response = step.measured.to_dict()
-            response["constraints_satisfied"] = response.pop("kept")
+        iterations, target = [], self.requirement.tightened()
+        for each in self.iterations:
+            before = self.iterations[each.parent].response if each.parent is not None else None
             iterations.append(
                 {
-                    "number": step.number,
-                    "parent": step.origin,
-                    "edit": describe_edit(step.edit, target) if step.edit else f"start: {self.start}",
-                    "result": describe_step(step, before, target, bounds=bool(self.bounds)),
-                    "change": dataclasses.asdict(step.edit) if step.edit else None,
-                    "seconds": step.seconds,
-                    "response": response,
+                    "number": each.number,
+                    "parent": each.parent,
+                    "edit": describe_edit(each.edit, target) if each.edit else f"start: {self.start}",
+                    "result": describe_iteration(each, before, target, bounds=bool(self.constraints)),
+                    "change": dataclasses.asdict(each.edit) if each.edit else None,
+                    "seconds": each.seconds,
+                    "response": each.response.to_dict(),
                 }
             )
         return {
@@ -79,8 +74,5 @@ class Tuning:
             "why": "" if self.met else self.why(),
             "directory": str(self.directory),
             "iterations": iterations,
-            "validations": [
-                {"iteration": each.step, "seed": each.seed, "judgement": each.judgement, "misses": each.misses}
-                for each in self.verdicts
-            ],
+            "validations": [dataclasses.asdict(each) for each in self.validations],
         }

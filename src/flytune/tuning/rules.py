@@ -1,4 +1,4 @@
-"""Rules: which field of the task to edit when something is missing of the response, and why (paper H1 to H11)."""
+"""Rules: which field of the task to edit when the response misses a requirement, and why (paper H1 to H11)."""
 
 import dataclasses
 import math
@@ -14,68 +14,65 @@ from flytune.config.document import Real
 from flytune.config.pytree import pytree
 from flytune.errors import BadInput
 
-# what can be missing -> the measure it is of, and the sign of what the rule is to do to it
-CONDITIONS = {
+# symptom -> the measure that misses its requirement, and the direction in which a rule has to move it
+SYMPTOMS = {
     "too slow": ("settling_time", -1),
     "too fast": ("settling_time", +1),
     "overshoots": ("overshoot", -1),
-    "inexact": ("error", -1),
+    "inaccurate": ("error", -1),
     "unsettled": ("settled", +1),
-    "breaks a bound": ("kept", +1),
+    "violates a constraint": ("constraints_satisfied", +1),
 }
 
 
 @pytree
 class Rule:
-    """One heuristic: while `when` is true of the response, move `field` in `direction`.
-
-    Errors of a rule are said when it is read: the slope has to promise what the condition wants.
-    """
+    """One heuristic: while the response has the symptom `when`, move `field` in `direction`."""
 
     name: str
     source: str = ""
-    advice: str = ""  # instead of all that follows: a rule for the reader, that no number's edit expresses
-    when: Literal["", "too slow", "too fast", "overshoots", "inexact", "unsettled", "breaks a bound"] = ""
+    advice: str = ""  # a hint for the reader instead of an edit; all that follows is left out
+    when: Literal["", "too slow", "too fast", "overshoots", "inaccurate", "unsettled", "violates a constraint"] = ""
     field: str = ""
     direction: Literal["", "up", "down"] = ""
-    slope: Real = 0.0  # d log(measure) / d log(field) where nothing was measured
-    largest: Annotated[Real, Gt(1)] = 2.0  # factor of one edit
+    slope: Real = 0.0  # d log(measure) / d log(field), used where no measured sensitivity applies
+    largest: Annotated[Real, Gt(1)] = 2.0  # largest factor of one edit
     range: tuple[Real, Real] = (0.0, 1e9)
-    spares: tuple[str, ...] = ()
-    says: str = ""
+    requires: tuple[str, ...] = ()  # measures; the rule is not used while one of them misses its requirement
+    reason: str = ""
 
     def problem(self) -> str | None:
-        """What makes the rule impossible, or None."""
-        if any("\n" in text for text in (self.name, self.says, self.source, self.advice)):
-            return "says: holds a line break. Allowed: one line, as for name, source and advice."
+        """Why the rule cannot be used, or None."""
+        if any("\n" in text for text in (self.name, self.reason, self.source, self.advice)):
+            return "reason: holds a line break. Allowed: one line. The same holds for name, source and advice."
         if self.advice:
             return None
         for name in ("when", "field", "direction"):
             if not getattr(self, name):
                 return f"{name}: missing. Allowed: a text; only a rule with advice has none."
-        sign = CONDITIONS[self.when][1] * (1 if self.direction == "up" else -1)
+        sign = SYMPTOMS[self.when][1] * (1 if self.direction == "up" else -1)
         if self.slope * sign <= 0:
             return (
                 f"slope: {self.slope:g} is not allowed. Allowed: {'above' if sign > 0 else 'below'} 0, or it does harm."
             )
         if not 0 < self.range[0] < self.range[1]:
             return f"range: {list(self.range)} is not allowed. Allowed: two numbers above 0, the smaller first."
-        known = {measure for measure, _ in CONDITIONS.values()}
-        if set(self.spares) - known:
-            return f"spares: {list(self.spares)} is not allowed. Allowed: {', '.join(sorted(known))}."
+        known = {measure for measure, _ in SYMPTOMS.values()}
+        if set(self.requires) - known:
+            return f"requires: {list(self.requires)} is not allowed. Allowed: {', '.join(sorted(known))}."
         return None
 
     @property
     def measure(self) -> str:
-        """The measure that the rule is to change."""
-        return CONDITIONS[self.when][0]
+        """The measure that the rule changes."""
+        return SYMPTOMS[self.when][0]
 
 
 def load_rules(extra: Path | None = None) -> list[Rule]:
-    """flytune's rules, and after them those of a TOML file of the user's own, which replace rules of the same name.
+    """The rules of flytune and those of the user's TOML file, which replace rules of the same name.
 
     Raises:
-        BadInput: the file cannot be read, or a rule in it makes no sense.
+        BadInput: the file cannot be read, or a rule in it cannot be used.
     """
     with resources.as_file(resources.files("flytune.tuning") / "rules.toml") as path:
         rules = {rule.name: rule for rule in _read(path)}
@@ -91,27 +88,31 @@ def _read(path: Path) -> list[Rule]:
     return [document.read(Rule, table, f"{path}: rule {number}") for number, table in enumerate(tables, start=1)]
 
 
-def conditions(misses: dict[str, float]) -> list[str]:
-    """Which conditions are true of what is missing, in the order in which they are best cured."""
+def symptoms(misses: dict[str, float]) -> list[str]:
+    """The symptoms that belong to the misses, in the order in which they should be treated."""
     found = []
     if "settled" in misses:
         found.append("unsettled")
     if "settling_time" in misses:
         found.append("too slow" if misses["settling_time"] > 0 else "too fast")
-    for measure, condition in (("kept", "breaks a bound"), ("overshoot", "overshoots"), ("error", "inexact")):
+    for measure, symptom in (
+        ("constraints_satisfied", "violates a constraint"),
+        ("overshoot", "overshoots"),
+        ("error", "inaccurate"),
+    ):
         if measure in misses:
-            found.append(condition)
+            found.append(symptom)
     return found
 
 
-def field_of(task: Mapping[str, Any], path: str) -> float | None:
+def number_at(task: Mapping[str, Any], path: str) -> float | None:
     """The number at a field path of a task's tables; None where the task has no such number."""
     number = _number_at(task, path)
     return None if number is None else float(number)
 
 
 def is_whole(task: Mapping[str, Any], path: str) -> bool:
-    """Whether the number at a field path of a task's tables is a whole one, and has to stay so."""
+    """Whether the number at a field path of a task's tables is an integer, and has to stay one."""
     return isinstance(_number_at(task, path), int)
 
 
@@ -127,18 +128,18 @@ def is_fixed(path: str, fixed: Sequence[str]) -> bool:
     return any(path == each or path.startswith(f"{each}.") for each in fixed)
 
 
-def moved(rule: Rule, value: float, factor: float) -> float:
-    """The field's value times `factor`, within the rule's range and its largest step, to three digits."""
+def apply_rule(rule: Rule, value: float, factor: float) -> float:
+    """The value times `factor`, within the rule's range and its largest factor, rounded to three digits."""
     limit = math.log(float(rule.largest))
-    step = math.exp(max(-limit, min(limit, math.log(factor))))
+    allowed = math.exp(max(-limit, min(limit, math.log(factor))))
     low, high = map(float, rule.range)
-    target = max(low, min(high, value * step))
+    target = max(low, min(high, value * allowed))
     return float(f"{target:.3g}")
 
 
 def rules_table(rules: Sequence[Rule]) -> str:
-    """The rules as a table for a terminal, and below it the advice that is no single number's edit."""
-    rows = [("rule", "when", "edit", "step at most", "within", "expects, if unmeasured", "not while", "because")]
+    """The rules as a table for a terminal, and below it the advice that no edit of a single number expresses."""
+    rows = [("rule", "when", "edit", "factor at most", "range", "effect, if not measured", "not while", "reason")]
     rows += [_row(rule) for rule in rules if not rule.advice]
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     lines = ["  ".join(text.ljust(width) for text, width in zip(row, widths, strict=True)).rstrip() for row in rows]
@@ -149,13 +150,13 @@ def rules_table(rules: Sequence[Rule]) -> str:
 def _row(rule: Rule) -> tuple[str, ...]:
     low, high = map(float, rule.range)
     measure = rule.measure.replace("_", " ")
-    expects = f"{measure} ~ field^{rule.slope:g}"
-    if rule.measure in ("settled", "kept"):
-        expects = "more trials settle" if rule.measure == "settled" else "fewer trials cross a bound"
-    guard = ", ".join(rule.spares).replace("_", " ")
+    expected = f"{measure} ~ field^{rule.slope:g}"
+    if rule.measure in ("settled", "constraints_satisfied"):
+        expected = "more trials settle" if rule.measure == "settled" else "fewer trials violate a constraint"
+    guard = ", ".join(rule.requires).replace("_", " ")
     return (
         rule.name, rule.when, f"{rule.field} {rule.direction}", f"x {rule.largest:g}", f"{low:g} to {high:g}",
-        expects, f"{guard} missed" if guard else "", f"{rule.says} ({rule.source})",
+        expected, f"{guard} missed" if guard else "", f"{rule.reason} ({rule.source})",
     )  # fmt: skip
 
 

@@ -1,4 +1,4 @@
-"""The effect map: what each parameter of a task was measured to do to the response, other parameters as in baseline-refined."""
+"""Sensitivities: the measured effect of each parameter of a task on the response, all others as in baseline-refined."""
 
 import dataclasses
 import json
@@ -9,24 +9,26 @@ from typing import Any, Literal
 
 import numpy as np
 
-FLOOR = {"settling_time": 1e-6, "overshoot": 0.002, "error": 1e-6}  # below this a measure counts as this
-NOTHING = {"settling_time": 0.1, "overshoot": 0.005, "error": 0.1}  # smaller changes over a whole curve count as none
-THRESHOLD = 0.8  # share of the whole change in one interval, from which on an effect has a threshold
+from flytune.evaluation.statistics import median
+
+FLOOR = {"settling_time": 1e-6, "overshoot": 0.002, "error": 1e-6}  # smaller values of a measure count as this one
+NO_EFFECT = {"settling_time": 0.1, "overshoot": 0.005, "error": 0.1}  # smaller changes over a whole curve are none
+THRESHOLD = 0.8  # an effect has a threshold where one interval has this share of the whole change
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Flown:
-    """One training at one value of a parameter, judged; None where too few trials have the measure."""
+class SeedResult:
+    """The response after one training at one value of a parameter; None where too few trials have the measure."""
 
     seed: int
-    settled: int  # trials whose position settled
+    settled: int  # number of trials whose position settled
     settling_time: float | None  # s, median of the position
     overshoot: float | None  # fraction of the step, median of the position
     error: float | None  # m, median of the position
     details: Mapping[str, Any]  # per axis, yaw error, violations, crashes
 
     def number(self, measure: str, axis: str = "position") -> float:
-        """A measure of the position or of an axis, +inf where too few trials have it; x, y and z share its error."""
+        """A measure of an axis, +inf where too few trials have it; the error of x, y and z is that of the position."""
         if axis == "position" or (measure == "error" and axis != "yaw"):
             value = getattr(self, measure)
         elif measure == "error":
@@ -38,36 +40,37 @@ class Flown:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Point:
-    """All trainings at one value of a parameter."""
+    """All trainings at one value of a parameter, one per seed."""
 
     value: float
-    seeds: Sequence[Flown]
+    seeds: Sequence[SeedResult]
 
     def numbers(self, measure: str, axis: str = "position") -> list[float]:
-        """The measure of each seed, +inf where there is none."""
-        return [flown.number(measure, axis) for flown in self.seeds]
+        """The measure of each seed, +inf where too few trials have it."""
+        return [result.number(measure, axis) for result in self.seeds]
 
-    def middle(self, measure: str, axis: str = "position") -> float:
-        """The median over seeds."""
-        return float(np.median(self.numbers(measure, axis)))
+    def median(self, measure: str, axis: str = "position") -> float:
+        """The median over the seeds."""
+        found = median(np.array(self.numbers(measure, axis)))
+        return math.inf if found is None else found
 
-    def apart(self, other: "Point", measure: str, axis: str = "position") -> bool:
-        """Whether every seed of one of the two values lies beyond every seed of the other."""
+    def differs_from(self, other: "Point", measure: str, axis: str = "position") -> bool:
+        """Whether the measure of every seed here is above, or below, that of every seed at the other value."""
         mine, others = self.numbers(measure, axis), other.numbers(measure, axis)
         return max(mine) < min(others) or max(others) < min(mine)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Curve:
-    """What one parameter does: its points in the order of their values."""
+    """The effect of one parameter: its points in the order of their values."""
 
     baseline: float
     points: Sequence[Point]
 
-    def around(self, value: float, up: bool = True) -> tuple[Point, Point]:
-        """The two measured values between which a parameter moves that leaves `value` upwards, or downwards.
+    def interval(self, value: float, up: bool = True) -> tuple[Point, Point]:
+        """The two neighbouring points between which the parameter moves if it is raised, or lowered, from `value`.
 
-        The outermost two beyond the ends. Values of 0 are left out.
+        Beyond the ends these are the outermost two points. A value of 0 is left out.
         """
         points = [point for point in self.points if point.value > 0]
         beyond = [point.value > value if up else point.value >= value for point in points]
@@ -77,93 +80,108 @@ class Curve:
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Effects:
-    """The whole map."""
+class Sensitivities:
+    """The curves of all parameters."""
 
     facts: Mapping[str, Any]  # command, base task, updates, trials, duration, seeds, versions
     parameters: Mapping[str, Curve]  # field path -> curve
 
-    def elasticity(
-        self, path: str, measure: str, value: float, axis: str = "position", up: bool = True
-    ) -> float | None:
-        """d log(measure) / d log(parameter) between the two values around `value`, of the medians over seeds.
+    def slope(self, path: str, measure: str, value: float, axis: str = "position", up: bool = True) -> float | None:
+        """d log(measure) / d log(parameter) in the interval at `value`, from the medians over the seeds.
 
-        None where the parameter was not measured, or one of the two has no finite median.
+        None where the parameter was not measured, or where a median is infinite.
+
+        Args:
+            path: field path of the parameter.
+            measure: settling_time, overshoot or error.
+            value: value of the parameter, in its own unit.
+            axis: position, x, y, z or yaw.
+            up: whether the parameter is to be raised.
         """
         if path not in self.parameters:
             return None
-        low, high = self.parameters[path].around(value, up)
-        first, second = (max(point.middle(measure, axis), FLOOR[measure]) for point in (low, high))
+        low, high = self.parameters[path].interval(value, up)
+        first, second = (max(point.median(measure, axis), FLOOR[measure]) for point in (low, high))
         if not (math.isfinite(first) and math.isfinite(second)):
             return None
         return math.log(second / first) / math.log(high.value / low.value)
 
-    def matters(self, path: str, measure: str, value: float, axis: str = "position", up: bool = True) -> bool:
-        """Whether the seeds of the two values around `value` are apart; True where the parameter was not measured."""
+    def is_significant(self, path: str, measure: str, value: float, axis: str = "position", up: bool = True) -> bool:
+        """Whether the seeds differ between the ends of the interval at `value`; True where it was not measured.
+
+        Args: those of `slope`.
+        """
         if path not in self.parameters:
             return True
-        low, high = self.parameters[path].around(value, up)
-        return low.apart(high, measure, axis)
+        low, high = self.parameters[path].interval(value, up)
+        return low.differs_from(high, measure, axis)
 
-    def moves(self, path: str, axis: str = "position") -> bool:
-        """Whether the parameter moves anything, somewhere between its first and its last value; True where not measured."""
+    def has_effect(self, path: str, axis: str = "position") -> bool:
+        """Whether the parameter changes any measure over its whole range; True where it was not measured."""
         if path not in self.parameters:
             return True
         first, *others = self.parameters[path].points
-        return any(first.apart(other, measure, axis) for other in others for measure in FLOOR)
+        return any(first.differs_from(other, measure, axis) for other in others for measure in FLOOR)
 
-    def ahead(self, path: str, value: float, up: bool, other: float) -> bool:
-        """Whether a parameter that leaves `value` moves between the same two measured values as from `other`; True where
-        it was not measured."""
+    def same_interval(self, path: str, value: float, up: bool, other: float) -> bool:
+        """Whether `value` and `other` lie in the same interval of the parameter; True where it was not measured."""
         if path not in self.parameters:
             return True
         curve = self.parameters[path]
-        return curve.around(value, up) == curve.around(other, up)
+        return curve.interval(value, up) == curve.interval(other, up)
 
-    def verdict(
+    def check_claim(
         self, path: str, measure: str, direction: Literal["up", "down"], axis: str = "position"
     ) -> Literal["confirmed", "wrong sign", "no effect", "only beyond a threshold"]:
-        """What became of the claim that raising the parameter moves the measure in `direction`, from the whole curve.
+        """The outcome of the claim that raising the parameter moves the measure in `direction`, from the whole curve.
 
-        No effect: from the first to the last value with a finite median the measure changes by less than 10 % (0.005
-        for the overshoot), or the seeds of the two are not apart. Only beyond a threshold: one interval between
-        neighbours carries at least 80 % of the change. A value where nothing settles is left out.
+        No effect: from the first to the last value the measure changes by less than 10 % (0.005 for the overshoot), or
+        the seeds at the two values do not differ. Only beyond a threshold: one interval between neighbouring values has
+        at least 80 % of the change. Values with an infinite median are left out.
+
+        Args:
+            path: field path of the parameter.
+            measure: settling_time, overshoot or error.
+            direction: the claimed one, up or down.
+            axis: position, x, y, z or yaw.
         """
-        points = [point for point in self.parameters[path].points if math.isfinite(point.middle(measure, axis))]
+        points = [point for point in self.parameters[path].points if math.isfinite(point.median(measure, axis))]
         if len(points) < 2:
             return "no effect"
-        middles = [point.middle(measure, axis) for point in points]
-        change = middles[-1] - middles[0]
-        least = NOTHING[measure] * (1.0 if measure == "overshoot" else min(middles))
-        if abs(change) < least or not points[0].apart(points[-1], measure, axis):
+        medians = [point.median(measure, axis) for point in points]
+        change = medians[-1] - medians[0]
+        least = NO_EFFECT[measure] * (1.0 if measure == "overshoot" else min(medians))
+        if abs(change) < least or not points[0].differs_from(points[-1], measure, axis):
             return "no effect"
         if (change > 0) != (direction == "up"):
             return "wrong sign"
-        steps = np.diff(middles) / change
-        return "only beyond a threshold" if len(steps) > 1 and steps.max() >= THRESHOLD else "confirmed"
+        shares = np.diff(medians) / change
+        return "only beyond a threshold" if len(shares) > 1 and shares.max() >= THRESHOLD else "confirmed"
 
 
-def load_effects() -> Effects:
-    """The map that ships with flytune, made by `python benchmarks/effect_map.py`."""
-    return read_effects((resources.files("flytune.tuning") / "sensitivity.json").read_text(encoding="utf-8"))
+def load_sensitivities() -> Sensitivities:
+    """The sensitivities that ship with flytune, measured by `python benchmarks/sensitivity.py`."""
+    return read_sensitivities((resources.files("flytune.tuning") / "sensitivity.json").read_text(encoding="utf-8"))
 
 
-def read_effects(text: str) -> Effects:
-    """The map of a JSON text."""
+def read_sensitivities(text: str) -> Sensitivities:
+    """The sensitivities of a JSON text."""
     told = json.loads(text)
     named = ("seed", "settled", "settling_time", "overshoot", "error")
 
-    def flown(row: dict[str, Any]) -> Flown:
+    def result(row: dict[str, Any]) -> SeedResult:
         details = {name: value for name, value in row.items() if name not in named}
-        return Flown(**{name: row[name] for name in named}, details=details)
+        return SeedResult(**{name: row[name] for name in named}, details=details)
 
     parameters = {
         path: Curve(
             baseline=curve["baseline"],
             points=[
-                Point(value=point["value"], seeds=[flown(row) for row in point["seeds"]]) for point in curve["points"]
+                Point(value=point["value"], seeds=[result(row) for row in point["seeds"]]) for point in curve["points"]
             ],
         )
         for path, curve in told["parameters"].items()
     }
-    return Effects(facts={name: value for name, value in told.items() if name != "parameters"}, parameters=parameters)
+    return Sensitivities(
+        facts={name: value for name, value in told.items() if name != "parameters"}, parameters=parameters
+    )

@@ -1,12 +1,13 @@
-"""What each parameter of a task really does to the response: the effect map that the tuner reads.
+"""Measure the effect of each parameter of a task on the response: the sensitivities that the tuner uses.
 
-    python benchmarks/effect_map.py --out effect-map    # trains what is missing there, then writes the package's data
-    python benchmarks/effect_map.py --docs              # draws docs/results/heuristics/ from it
+    python benchmarks/sensitivity.py --out sensitivity    # trains what is missing there, then writes the package's data
+    python benchmarks/sensitivity.py --docs               # tables and drawing of the documentation from that data
 
-One parameter of baseline-refined at a time, five values, three seeds of episodes and noise; trained as the tuner trains, on
-from the policy that ships. (From new weights, 300 updates leave the unchanged baseline at 5.4 s, on its way to 3.0 s:
-what is then measured is how far a training has come.) The unchanged task is trained once per seed and stands in the
-curve of every parameter. Processes side by side, one per core.
+One parameter of baseline-refined is changed at a time: five values, three seeds of episodes and noise. Every training
+starts from the policy that ships, as those of the tuner do. (A training from new weights has not converged after 300
+updates: the unchanged baseline then settles in 5.4 s instead of 3.0 s, and the differences would be those of the
+convergence.) The unchanged task is trained once per seed and is part of the curve of every parameter. One process per
+core.
 """
 
 import argparse
@@ -19,7 +20,7 @@ from importlib import metadata
 from pathlib import Path
 
 BASE = "baseline-refined"
-TRIALS, DURATION, SEED = 100, 20.0, 2000  # of the judgement
+TRIALS, DURATION, SEED = 100, 20.0, 2000  # of the evaluation
 PARAMETERS = {
     "reward.survival.reward": (0.0, 0.02, 0.05, 0.1, 0.3),
     "reward.horizontal.wide": (0.125, 0.25, 0.5, 1.0, 4.0),
@@ -34,15 +35,15 @@ PARAMETERS = {
     "termination.body_rate.bound_deg_per_s": (115.0, 230.0, 530.0, 1000.0, 2000.0),
 }
 HERE = Path(__file__).parents[1]
-DATA = HERE / "src" / "flytune" / "tune" / "effects.json"
-DOCS = HERE / "docs" / "results" / "heuristics"
+DATA = HERE / "src" / "flytune" / "tuning" / "sensitivity.json"
+DOCS = HERE / "docs" / "heuristics"
 
 
 def jobs(seeds: int) -> list[tuple[str | None, float | None, int]]:
     """Every training: parameter, value, seed; the unchanged task once per seed."""
     from flytune.config.document import plain
     from flytune.task.task import load_task
-    from flytune.tuning.rules import field_of
+    from flytune.tuning.rules import number_at
 
     tables = plain(load_task(BASE))
     changed = [
@@ -50,19 +51,19 @@ def jobs(seeds: int) -> list[tuple[str | None, float | None, int]]:
         for parameter, values in PARAMETERS.items()
         for value in values
         for seed in range(seeds)
-        if value != field_of(tables, parameter)
+        if value != number_at(tables, parameter)
     ]
     return [(None, None, seed) for seed in range(seeds)] + changed
 
 
 def file_of(folder: Path, job: tuple[str | None, float | None, int]) -> Path:
-    """Where the judgement of a training is kept."""
+    """Where the judgement of a training is constraints_satisfied."""
     parameter, value, seed = job
     return folder / f"{parameter or 'baseline'}-{'' if value is None else f'{value:g}'}-s{seed}.json"
 
 
-def fly_one(folder: Path, updates: int, job: tuple[str | None, float | None, int]) -> None:
-    """Train one task and write down how it flies."""
+def measure_one(folder: Path, updates: int, job: tuple[str | None, float | None, int]) -> None:
+    """Train one task and write its response to a file."""
     from flytune.control.policy import load_policy
     from flytune.errors import Diverged
     from flytune.evaluation.fly import fly
@@ -106,21 +107,21 @@ def fly_one(folder: Path, updates: int, job: tuple[str | None, float | None, int
 
 
 def measure(folder: Path, updates: int, seeds: int, workers: int) -> None:
-    """Train what is missing, and put all together."""
+    """Train what is missing, and collect all results."""
     folder.mkdir(parents=True, exist_ok=True)
     plan = folder / "plan.json"
     asked = {"trainer": "apg", "updates": updates, "base": BASE}
     if plan.exists() and json.loads(plan.read_text(encoding="utf-8")) != asked:
-        raise SystemExit(f"{folder}: holds a map of other trainings. Give another folder.")
+        raise SystemExit(f"{folder}: holds results of other trainings. Give another folder.")
     plan.write_text(json.dumps(asked), encoding="utf-8")
     missing = [(folder, updates, job) for job in jobs(seeds) if not file_of(folder, job).exists()]
     if missing:
         with multiprocessing.get_context("spawn").Pool(workers) as pool:
-            pool.starmap(fly_one, missing, chunksize=1)
+            pool.starmap(measure_one, missing, chunksize=1)
 
     from flytune.config.document import plain
     from flytune.task.task import load_task
-    from flytune.tuning.rules import field_of
+    from flytune.tuning.rules import number_at
 
     tables = plain(load_task(BASE))
 
@@ -131,7 +132,7 @@ def measure(folder: Path, updates: int, seeds: int, workers: int) -> None:
 
     told = {
         "schema": 1,
-        "command": f"python benchmarks/effect_map.py --seeds {seeds} --updates {updates}",
+        "command": f"python benchmarks/sensitivity.py --seeds {seeds} --updates {updates}",
         **asked,
         "trials": TRIALS,
         "duration": DURATION,
@@ -140,7 +141,7 @@ def measure(folder: Path, updates: int, seeds: int, workers: int) -> None:
         | {"python": platform.python_version()},
         "parameters": {
             parameter: {
-                "baseline": (baseline := field_of(tables, parameter)),
+                "baseline": (baseline := number_at(tables, parameter)),
                 "points": [{"value": value, "seeds": rows(parameter, value, baseline)} for value in values],
             }
             for parameter, values in PARAMETERS.items()
@@ -151,26 +152,25 @@ def measure(folder: Path, updates: int, seeds: int, workers: int) -> None:
 
 
 def document_it() -> None:
-    """Tables and the drawing from the measured data."""
-    from flytune.tuning.heuristics import draw_effects, heuristics_tables
-    from flytune.tuning.sensitivity import load_effects
+    """Write the tables and the drawing of the documentation from the measured data."""
+    from flytune.tuning.heuristics import draw_sensitivities, heuristics_tables
+    from flytune.tuning.sensitivity import load_sensitivities
 
-    effects = load_effects()
+    sensitivities = load_sensitivities()
     DOCS.mkdir(exist_ok=True)
-    draw_effects(DOCS / "effects.svg", effects)
-    (DOCS / "tables.md").write_text(
-        "# The paper's heuristics: every number\n\n" + heuristics_tables(effects), encoding="utf-8"
-    )
+    draw_sensitivities(DOCS / "sensitivity.svg", sensitivities)
+    tables = "# The paper's heuristics: every number\n\n" + heuristics_tables(sensitivities)
+    (DOCS / "tables.md").write_text(tables, encoding="utf-8")
     print(DOCS)
 
 
 if __name__ == "__main__":
     os.environ.setdefault("XLA_FLAGS", "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1")
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--out", type=Path, default=Path("effect-map"))
+    parser.add_argument("--out", type=Path, default=Path("sensitivity"))
     parser.add_argument("--updates", type=int, default=200)
     parser.add_argument("--seeds", type=int, default=3)
     parser.add_argument("--workers", type=int, default=os.cpu_count() or 1)
-    parser.add_argument("--docs", action="store_true", help="draw what was measured; trains nothing")
+    parser.add_argument("--docs", action="store_true", help="only write the tables and the drawing")
     options = parser.parse_args()
     document_it() if options.docs else measure(options.out, options.updates, options.seeds, options.workers)

@@ -1,0 +1,124 @@
+"""The call that tunes: from a wanted step response to a policy, with the run directory and the page of the tuning."""
+
+import os
+import time
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from flytune.errors import BadInput, Interrupted
+from flytune.report.tuning import write_tuning
+from flytune.training.loop import Progress
+from flytune.training.trainer import DEFAULT_TRAINER, find_trainer
+from flytune.tuning.loop import Tuner
+from flytune.tuning.messages import line
+from flytune.tuning.requirement import Requirement, make_requirement
+from flytune.tuning.result import Tuning
+from flytune.tuning.rules import Rule, load_rules
+
+
+def tune(
+    settling_time: float,
+    *,
+    overshoot: float = 5.0,
+    error: float | None = None,
+    axis: str = "position",
+    percentile: float = 50.0,
+    at_most: bool = False,
+    tolerance: float = 10.0,
+    task: str | None = None,
+    edits: Mapping[str, Any] | None = None,
+    rules: str | Path | Sequence[Rule] | None = None,
+    trainer: str = DEFAULT_TRAINER,
+    seed: int = 0,
+    most_iterations: int = 12,
+    out: str | Path | None = None,
+    resume: bool = False,
+    on_message: Callable[[str], None] | None = None,
+    on_progress: Callable[[Progress], None] | None = None,
+) -> Tuning:
+    """The policy whose measured step response meets a requirement, or the nearest one that the rules can find.
+
+    Afterwards the directory is a run directory of the best policy, and holds `report.html`, the journal `tune.json`,
+    and one run directory per iteration under `iterations/`.
+
+    Args:
+        settling_time: wanted settling time in s.
+        overshoot: largest allowed overshoot in percent of the step, median of the trials.
+        error: largest allowed steady-state error, median of the trials, in m (in deg for yaw); 0.01 m or 1 deg where
+            None.
+        axis: whose response: position, x, y, z or yaw.
+        percentile: percentile of the trials at which the settling time is taken.
+        at_most: whether the settling time is an upper bound instead of a target.
+        tolerance: allowed deviation from the settling time in percent.
+        task: the task to begin with, a preset or a TOML file; the known task whose policy settles nearest where None.
+        edits: field path -> value; the tuning leaves these fields as they are, and keeps a termination bound among
+            them as a constraint.
+        rules: a TOML file of rules to use beside those of flytune, or the rules to use; those of flytune where None.
+        trainer: name of the trainer, one that trains every task; see `flytune tune --help`.
+        seed: seed of the trainings.
+        most_iterations: largest number of edits.
+        out: directory to write; a new one under `runs/` where None.
+        resume: whether to continue the tuning in `out`.
+        on_message: called with one line for each edit and each result.
+        on_progress: called after every update of a training.
+
+    Raises:
+        BadInput: an argument cannot be used, or no controller can meet the requirement; nothing was written.
+        Diverged: numbers became infinite in the first training.
+        Interrupted: Ctrl-C; the results so far are in the directory.
+    """
+    began = time.monotonic()
+    requirement = make_requirement(
+        settling_time, overshoot, error, at_most=at_most, tolerance=tolerance, axis=axis, percentile=percentile
+    )
+    if rules is None or isinstance(rules, str | Path):
+        rules = load_rules(None if rules is None else Path(rules))
+    directory = _directory(out, requirement, resume)
+    find_trainer(trainer, every_task=True)
+    if not 1 <= most_iterations <= 100:
+        raise BadInput(f"iterations: {most_iterations} is not allowed. Allowed: a whole number, 1 to 100.")
+    if not 0 <= seed < 2**32:
+        raise BadInput(f"seed: {seed} is not allowed. Allowed: a whole number, 0 to {2**32 - 1}.")
+    say = on_message or (lambda _: None)
+    tuner = Tuner(
+        requirement, rules, directory, task=task, edits=edits or {}, seed=seed, trainer=trainer,
+        most_iterations=most_iterations, on_message=say, on_progress=on_progress,
+    )  # fmt: skip
+    if resume:
+        tuner.history.read()
+    try:
+        result = tuner.run()
+    except (Interrupted, KeyboardInterrupt):
+        raise Interrupted(
+            f"interrupted in iteration {len(tuner.history.iterations)}. All results so far are in {directory}. "
+            f"To continue, repeat the command with --out {directory} and --resume."
+        ) from None
+    write_tuning(directory / "report.html", result.to_dict())
+    trainings = sum(each.seconds > 0 for each in result.iterations)
+    outcome = f"requirement {'met' if result.met else 'not met'}; the best policy is that of iteration {result.best}"
+    say(line("result", f"{outcome}, after {trainings} trainings and {time.monotonic() - began:.0f} s"))
+    return result
+
+
+def _directory(out: str | Path | None, requirement: Requirement, resume: bool) -> Path:
+    """The directory to write.
+
+    Raises:
+        BadInput: it is a file, or it holds a tuning or a run; or there is none to resume.
+    """
+    if out is None:
+        if resume:
+            raise BadInput("resume: needs --out DIR, the directory of the tuning to continue.")
+        base = Path("runs") / f"tune-{requirement.settling_time:g}s"
+        path, number = base, 2
+        while path.exists():
+            path, number = base.with_name(f"{base.name}-{number}"), number + 1
+        return path
+    directory = Path(out)
+    # not Path.exists, which raises where a name is too long
+    if os.path.exists(directory) and not os.path.isdir(directory):
+        raise BadInput(f"out: {directory} is a file. Give a directory that does not exist yet.")
+    if not resume and any(os.path.exists(directory / name) for name in ("tune.json", "run.json", "iterations")):
+        raise BadInput(f"out: {directory} already holds a tuning or a run. Give another directory, or --resume.")
+    return directory
