@@ -36,7 +36,7 @@ PARAMETERS = {
 }
 HERE = Path(__file__).parents[1]
 DATA = HERE / "src" / "flytune" / "tuning" / "sensitivity.json"
-DOCS = HERE / "docs" / "heuristics"
+DOCS = HERE / "docs" / "results" / "heuristics"
 
 
 def jobs(seeds: int) -> list[tuple[str | None, float | None, int]]:

@@ -50,7 +50,7 @@ def test_an_edit_names_its_symptom_its_size_its_prediction_and_its_reason():
         ({"before": 0.3}, "sensitivity measured from 0.3 to 0.5). H7"),
         ({"unit": "1/unit(e)^2"}, "0.2 -> 0.304, expected"),
         ({"symptom": "inaccurate", "expected": 0.002}, "expected error 2.00 mm (error ~ bound"),
-        ({"source": "flytune: docs"}, "shortens the cruise (flytune: docs). Next"),
+        ({"source": "flytune: docs"}, "fly faster (flytune: docs). Next"),
     ],
     ids=["iterations", "rule", "interpolation", "no-number", "half-way", "inside", "no-unit", "error", "source"],
 )

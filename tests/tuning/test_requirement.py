@@ -118,7 +118,7 @@ def test_a_flight_is_measured_as_the_judge_measures_it(pid_flights):
     assert late.settling_time == told["axes"]["yaw"]["settling_time"]["p95"]
 
 
-def test_only_bounds_the_user_has_set_have_to_be_kept(pid_flights):
+def test_only_bounds_the_user_has_set_are_constraints(pid_flights):
     judged = judge(pid_flights)
     broken = np.zeros(40, bool)
     broken[:10] = True
