@@ -52,7 +52,9 @@ if TYPE_CHECKING:
     from flytune.task.task import write_task as write_task
     from flytune.training.loop import Run as Run
     from flytune.training.loop import train as train
+    from flytune.tuning.result import Tuning as Tuning
     from flytune.tuning.rules import load_rules as load_rules
+    from flytune.tuning.tune import tune as tune
 
     __version__: str
 
@@ -73,7 +75,9 @@ _MODULES = {
     "flytune.runs.find": ("FoundController", "find_controller"),
     "flytune.task.task": ("Task", "load_task", "write_task"),
     "flytune.training.loop": ("Run", "train"),
+    "flytune.tuning.result": ("Tuning",),
     "flytune.tuning.rules": ("load_rules",),
+    "flytune.tuning.tune": ("tune",),
 }
 _HOMES = {name: module for module, names in _MODULES.items() for name in names}
 
