@@ -18,16 +18,16 @@ import numpy as np
 from flytune.control.policy import load_policy
 from flytune.evaluation.fly import fly
 from flytune.evaluation.judge import AXES, judge
-from flytune.reproduction.study import ROLES, Study
+from flytune.reproduction.study import BEHAVIOURS, Study
 from flytune.runs.directory import read_facts
 from flytune.runs.shipped import HOME
 
 SEED = 1000  # of starts and noise; evaluations use 1
 
 
-def quality(directory: Path, study: Study, role: str) -> tuple[int, float]:
+def quality(directory: Path, study: Study, behaviour: str) -> tuple[int, float]:
     """More is better: feasible trials settled on all axes, and the median error with its sign turned."""
-    judgement = judge(fly(load_policy(directory / "policy.safetensors"), study.task(role), trials=200, seed=SEED))
+    judgement = judge(fly(load_policy(directory / "policy.safetensors"), study.task(behaviour), trials=200, seed=SEED))
     settled = np.all([np.isfinite(judgement.settling_time[axis]) for axis in AXES], axis=0)
     return int(np.sum(settled & ~judgement.infeasible)), -float(np.median(judgement.steady_state_error["position"]))
 
@@ -36,9 +36,9 @@ def ship(folder: Path, commit: str | None) -> None:
     """Copy the best policies of one study; `commit` is that of its code, where it did not run from a checkout."""
     told = json.loads((folder / "verdicts.json").read_text(encoding="utf-8"))
     study = Study(folder=folder, **{name: told[name] for name in ("trainer", "steps", "refined", "seeds")})
-    for role in ROLES:
-        members = [member for member in study.members() if member.role == role]
-        ranked = sorted(members, key=lambda member: quality(member.directory, study, role), reverse=True)
+    for behaviour in BEHAVIOURS:
+        trainings = [training for training in study.trainings() if training.behaviour == behaviour]
+        ranked = sorted(trainings, key=lambda training: quality(training.directory, study, behaviour), reverse=True)
         best = ranked[0]
         stem = f"{best.preset}@{study.trainer}"
         target = Path(str(HOME))
@@ -49,7 +49,7 @@ def ship(folder: Path, commit: str | None) -> None:
         facts["command"] = f"flytune train {best.preset} --trainer {study.trainer} --seed {best.seed}".split()
         facts["commit"] = facts["commit"] or commit
         (target / f"{stem}.json").write_text(json.dumps(facts, indent=2) + "\n", encoding="utf-8")
-        print(f"{stem}: seed {best.seed}, {quality(best.directory, study, role)}")
+        print(f"{stem}: seed {best.seed}, {quality(best.directory, study, behaviour)}")
 
 
 if __name__ == "__main__":

@@ -45,6 +45,8 @@ if TYPE_CHECKING:
     from flytune.report.comparison import write_comparison as write_comparison
     from flytune.report.report import Entry as Entry
     from flytune.report.report import write_report as write_report
+    from flytune.reproduction.reproduction import Reproduction as Reproduction
+    from flytune.reproduction.reproduction import reproduce as reproduce
     from flytune.runs.find import FoundController as FoundController
     from flytune.runs.find import find_controller as find_controller
     from flytune.task.task import Task as Task
@@ -72,6 +74,7 @@ _MODULES = {
     "flytune.physics.vehicle": ("Vehicle", "load_vehicle"),
     "flytune.report.comparison": ("write_comparison",),
     "flytune.report.report": ("Entry", "write_report"),
+    "flytune.reproduction.reproduction": ("Reproduction", "reproduce"),
     "flytune.runs.find": ("FoundController", "find_controller"),
     "flytune.task.task": ("Task", "load_task", "write_task"),
     "flytune.training.loop": ("Run", "train"),

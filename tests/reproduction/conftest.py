@@ -7,8 +7,8 @@ import pytest
 
 from flytune.evaluation.flights import Flights
 from flytune.evaluation.judge import judge
-from flytune.reproduction.evidence import CONDITIONS, FLOWN, Evidence, Seat
-from flytune.reproduction.study import ROLES, Study
+from flytune.reproduction.evidence import SETTINGS, WEIGHTS_FILES, Evaluation, Evidence
+from flytune.reproduction.study import BEHAVIOURS, Study
 
 TARGET = np.array([0.0, 0.0, 1.0])
 DISTANCES = np.linspace(0.5, 2.0, 20)  # m, of the trials along x
@@ -62,32 +62,32 @@ def make_evidence(tmp_path):
 
     def make(constants, offsets=None, curves=None):
         study = Study(folder=tmp_path / "study", seeds=2)
-        seats = {}
-        for role in ROLES:
-            flights = first_order(constants[role], (offsets or {}).get(role, 0.0))
+        evaluations = {}
+        for behaviour in BEHAVIOURS:
+            flights = first_order(constants[behaviour], (offsets or {}).get(behaviour, 0.0))
             judgement = judge(flights)
             ways = np.abs(flights.position[:, [0, -1], 0])
-            seat = Seat(
+            evaluation = Evaluation(
                 judgements=[judgement, judgement],
                 flights=flights,
                 rotor_speed=np.full((2, DISTANCES.size), 16_004.0),
                 progress=np.tile(1 - ways[:, 1] / ways[:, 0], (2, 1)),
                 distance=np.tile(ways[:, 0], (2, 1)),
             )
-            for flown in FLOWN:
-                for condition in CONDITIONS:
-                    seats[role, flown, condition.name] = seat
+            for weights in WEIGHTS_FILES:
+                for setting in SETTINGS:
+                    evaluations[behaviour, weights, setting.name] = evaluation
         return Evidence(
             study=study,
-            tasks={role: study.task(role) for role in ROLES},
-            seats=seats,
-            curves=curves or {role: [curve(100.0), curve(101.0)] for role in ROLES},
+            tasks={behaviour: study.task(behaviour) for behaviour in BEHAVIOURS},
+            evaluations=evaluations,
+            curves=curves or {behaviour: [curve(100.0), curve(101.0)] for behaviour in BEHAVIOURS},
         )
 
     return make
 
 
 @pytest.fixture
-def change_seat():
-    """A seat with other judgements."""
-    return lambda seat, judgements: dataclasses.replace(seat, judgements=judgements)
+def change_evaluation():
+    """A evaluation with other judgements."""
+    return lambda evaluation, judgements: dataclasses.replace(evaluation, judgements=judgements)

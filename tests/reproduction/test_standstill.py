@@ -39,7 +39,7 @@ def test_beyond_the_distance_the_fastest_flight_earns_less_than_staying(discount
     assert worth_of_flying(limit - 0.15, discount) > worth_of_staying(limit - 0.15, discount)
 
 
-def test_a_patient_pilot_flies_from_everywhere():
+def test_with_a_discount_near_one_flying_earns_most_from_everywhere():
     assert standstill_distance(load_task("inspection"), 0.999) is None
     assert standstill_distance(load_task("baseline"), 0.995) is None
 

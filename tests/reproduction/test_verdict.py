@@ -3,45 +3,44 @@
 import numpy as np
 import pytest
 
-from flytune.reproduction.verdict import Measure, decide, middle, share
+from flytune.reproduction.verdict import Measure, decide, median_of_trials, share_of_trials
 
-YES, NO, ASIDE = (Measure(what="", value=1.0, agrees=word) for word in (True, False, None))
+YES, NO, INFORMS = (Measure(what="", value=1.0, agrees=agrees) for agrees in (True, False, None))
 
 
 def test_a_share_counts_every_trial_of_every_seed():
-    measure = share("", [np.array([True, True, False, True]), np.array([True] * 4)])
+    measure = share_of_trials("", [np.array([True, True, False, True]), np.array([True] * 4)])
     assert measure.value == 7 / 8
     assert measure.low is not None and measure.high is not None
     assert measure.low <= 7 / 8 <= measure.high
 
 
 def test_a_share_agrees_only_where_its_whole_interval_reaches_the_threshold():
-    all_of_them = share("", [np.ones(100, bool)] * 3)
+    all_of_them = share_of_trials("", [np.ones(100, bool)] * 3)
     assert (all_of_them.low, all_of_them.agrees) == (1.0, True)
     # 96 of 100: the estimate is above 95 %, the lower end of its interval is not
-    nearly = share("", [np.arange(100) < 96])
+    nearly = share_of_trials("", [np.arange(100) < 96])
     assert nearly.value == 0.96
     assert nearly.low is not None and nearly.low < 0.95
     assert nearly.agrees is False
-    assert share("", [np.ones(3, bool)], None).agrees is None
+    assert share_of_trials("", [np.ones(3, bool)], None).agrees is None
 
 
 def test_seeds_that_differ_widen_the_interval():
-    alike = share("", [np.arange(100) % 2 == 0] * 4)
-    apart = share("", [np.ones(100, bool), np.zeros(100, bool)] * 2)
+    alike = share_of_trials("", [np.arange(100) % 2 == 0] * 4)
+    apart = share_of_trials("", [np.ones(100, bool), np.zeros(100, bool)] * 2)
     assert alike.value == apart.value == 0.5
     assert apart.high - apart.low > 3 * (alike.high - alike.low)
 
 
 def test_a_median_in_which_most_trials_failed_is_no_number():
-    measure = middle("", [np.array([1.0, np.inf, np.inf])], "s", at_most=5.0)
-    assert measure.value is None and measure.agrees is False
-    assert measure.text().startswith("-")
-    assert middle("", [np.array([1.0, 2.0, 3.0])], "s", at_most=5.0).agrees
+    measure = median_of_trials("", [np.array([1.0, np.inf, np.inf])], "s")
+    assert measure.value is None and measure.text().startswith("- s")
+    assert median_of_trials("", [np.array([1.0, 2.0, np.inf])], "s").value == 2.0
 
 
 @pytest.mark.parametrize(
-    ("printed", "reading", "word"),
+    ("printed", "reading", "verdict"),
     [
         ([YES, YES], [NO], "holds"),
         ([YES, NO], [YES], "holds under a reading"),
@@ -49,11 +48,11 @@ def test_a_median_in_which_most_trials_failed_is_no_number():
         ([NO], [YES, NO], "does not hold"),
         ([NO], [], "does not hold"),
         ([], [], "does not hold"),
-        ([], [ASIDE], "does not hold"),
+        ([], [INFORMS], "does not hold"),
     ],
 )
-def test_a_claim_holds_as_printed_or_under_a_reading_or_not(printed, reading, word):
-    assert decide(printed, reading) == word
+def test_a_claim_holds_as_printed_or_under_a_reading_or_not(printed, reading, verdict):
+    assert decide(printed, reading) == verdict
 
 
 @pytest.mark.parametrize(

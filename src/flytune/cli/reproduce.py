@@ -2,7 +2,6 @@
 
 import json
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Annotated
 
 from cyclopts import Parameter
@@ -34,19 +33,19 @@ class ReproduceOptions:
 def reproduce(*, options: ReproduceOptions = ReproduceOptions()) -> None:
     """Run the paper again: three behaviours, every figure, and a verdict on each claim."""
     from flytune.reproduction.reproduction import reproduce
-    from flytune.reproduction.study import Study
-    from flytune.reproduction.trainings import show_all
+    from flytune.reproduction.study import BEHAVIOURS
+    from flytune.reproduction.trainings import show_trainings
 
-    name = f"reproduction-{options.trainer}{'-refined' if options.refined else ''}"
-    study = Study(
-        folder=options.out or Path("runs") / name,
-        trainer=options.trainer,
-        seeds=options.seeds,
-        steps=options.steps,
-        refined=options.refined,
-    )
-    with show_all(study) as (on_progress, tell):
-        result = reproduce(study, on_progress=on_progress, tell=tell)
+    with show_trainings(options.seeds * len(BEHAVIOURS)) as (on_progress, on_message):
+        result = reproduce(
+            options.out,
+            trainer=options.trainer,
+            seeds=options.seeds,
+            steps=options.steps,
+            refined=options.refined,
+            on_progress=on_progress,
+            on_message=on_message,
+        )
     print(json.dumps(result.to_dict()) if options.as_json else result.table(), flush=True)
     if not options.as_json:
-        print(study.folder / "report.html")
+        print(result.study.folder / "report.html")

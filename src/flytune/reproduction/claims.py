@@ -1,7 +1,7 @@
 """A verdict for each claim of the paper, R23 to R30 and H1 to H11.
 
-Verdicts rest on the weights of the last update, what the paper would have flown; the averaged weights stand beside
-them and carry no verdict.
+Verdicts rest on the weights of the last update, which the paper would have flown. The averaged weights stand beside
+them without a verdict.
 """
 
 import tomllib
@@ -11,12 +11,12 @@ from typing import Any
 
 from flytune.config import document
 from flytune.reproduction import learning, measures
-from flytune.reproduction.evidence import Evidence, Flown
-from flytune.reproduction.measures import Measured
-from flytune.reproduction.study import ROLES
-from flytune.reproduction.verdict import Measure, Verdict, decide
+from flytune.reproduction.evidence import Evidence, Weights
+from flytune.reproduction.measures import ClaimMeasures
+from flytune.reproduction.study import BEHAVIOURS
+from flytune.reproduction.verdict import JudgedClaim, Measure, decide
 
-MEASURES: dict[str, Callable[[Evidence, Flown], Measured]] = {
+MEASURES: dict[str, Callable[[Evidence, Weights], ClaimMeasures]] = {
     "R23-damping": measures.damping,
     "R23-error": measures.steady_state,
     "R24": measures.order,
@@ -32,71 +32,58 @@ MEASURES: dict[str, Callable[[Evidence, Flown], Measured]] = {
 OF_TRAINING = {"R27-variance", "R27-survival", "R28"}  # nothing is flown, so there is no row for averaged weights
 
 
-def claims(evidence: Evidence, items: Collection[str] | None = None) -> list[Verdict]:
-    """The verdicts, in the order of the paper's items; all of them where `items` is None."""
-    words = tomllib.loads((resources.files("flytune.reproduction") / "claims.toml").read_text(encoding="utf-8"))
+def judge_claims(evidence: Evidence, items: Collection[str] | None = None) -> list[JudgedClaim]:
+    """Every claim with its verdict, in the order of the paper's items; all of them where `items` is None."""
+    texts = tomllib.loads((resources.files("flytune.reproduction") / "claims.toml").read_text(encoding="utf-8"))
     return [
         _heuristic(evidence, item, text) if "parameters" in text else _claim(evidence, item, text)
-        for item, text in words.items()
+        for item, text in texts.items()
         if items is None or item in items
     ]
 
 
-def _claim(evidence: Evidence, item: str, text: dict[str, Any]) -> Verdict:
+def _claim(evidence: Evidence, item: str, text: dict[str, Any]) -> JudgedClaim:
     last = MEASURES[item](evidence, "last")
-    average = [] if item in OF_TRAINING else _all(MEASURES[item](evidence, "average"))
     reason = text.get("untestable")
-    return Verdict(
+    return JudgedClaim(
         item=item,
         claim=text["claim"],
-        word="cannot be tested as printed" if reason else decide(last.printed, last.reading),
+        verdict="cannot be tested as printed" if reason else decide(last.printed, last.reading),
         reading=text["reading"],
         why=f"{reason[0].upper()}{reason[1:]}. {text['why']}" if reason else text["why"],
-        measures=_all(last),
-        average=average,
+        measures=last.all(),
+        averaged=[] if item in OF_TRAINING else MEASURES[item](evidence, "averaged").all(),
     )
 
 
-def _all(measured: Measured) -> list[Measure]:
-    return [*measured.printed, *measured.reading, *measured.aside]
-
-
-def _heuristic(evidence: Evidence, item: str, text: dict[str, Any]) -> Verdict:
+def _heuristic(evidence: Evidence, item: str, text: dict[str, Any]) -> JudgedClaim:
     """What three presets can say of one parameter: its values, and how many others changed with it."""
-    tables = {role: document.plain(evidence.tasks[role]) for role in ROLES}
+    leaves = {behaviour: _leaves(document.plain(task)) for behaviour, task in evidence.tasks.items()}
     rows = []
     for parameter in text["parameters"]:
-        values = {role: _look_up(tables[role], parameter) for role in ROLES}
-        rows.append(
-            Measure(what=f"{parameter}: " + ", ".join(f"{role} {value}" for role, value in values.items()), value=None)
-        )
-    flat = {
-        role: dict(_leaves({key: table[key] for key in ("reward", "termination")})) for role, table in tables.items()
-    }
-    for role in ("acrobatic", "inspection"):
-        paths = sorted(set(flat["baseline"]) | set(flat[role]))
-        changed = [path for path in paths if flat["baseline"].get(path) != flat[role].get(path)]
-        rows.append(Measure(what=f"parameters in which {role} differs from baseline", value=float(len(changed))))
-    return Verdict(
+        values = ", ".join(f"{behaviour} {leaves[behaviour].get(parameter, 'none')}" for behaviour in BEHAVIOURS)
+        rows.append(Measure(what=f"{parameter}: {values}", value=None))
+    for behaviour in ("acrobatic", "inspection"):
+        ours, baseline = leaves[behaviour], leaves["baseline"]
+        changed = [
+            path
+            for path in ours.keys() | baseline.keys()
+            if path.startswith(("reward.", "termination.")) and ours.get(path) != baseline.get(path)
+        ]
+        rows.append(Measure(what=f"parameters in which {behaviour} differs from baseline", value=float(len(changed))))
+    return JudgedClaim(
         item=item,
         claim=text["claim"],
-        word="cannot be tested as printed",
+        verdict="cannot be tested as printed",
         reading="One parameter at a time would be needed.",
         why=f"Three presets that differ in many parameters at once cannot show what one of them does. {text['why']}",
         measures=rows,
     )
 
 
-def _look_up(table: Any, path: str) -> str:
-    for name in path.split("."):
-        if not isinstance(table, dict) or name not in table:
-            return "none"
-        table = table[name]
-    return str(table)
-
-
-def _leaves(table: dict[str, Any], path: str = "") -> list[tuple[str, Any]]:
-    found = []
+def _leaves(table: dict[str, Any], path: str = "") -> dict[str, Any]:
+    """Every value of nested tables by its dotted path."""
+    found = {}
     for name, value in table.items():
-        found += _leaves(value, f"{path}{name}.") if isinstance(value, dict) else [(f"{path}{name}", value)]
+        found |= _leaves(value, f"{path}{name}.") if isinstance(value, dict) else {f"{path}{name}": value}
     return found

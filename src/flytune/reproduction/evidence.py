@@ -1,28 +1,30 @@
-"""What the policies of a study fly like: every policy, seed and condition, judged."""
+"""How the policies of a study fly: every policy of every seed, judged under every evaluation setting."""
 
 import dataclasses
 import json
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
+from jaxtyping import Float
 
 from flytune.control.policy import load_policy
 from flytune.evaluation.flights import Flights
 from flytune.evaluation.fly import InitialConditions, fly
 from flytune.evaluation.judge import Judgement, judge
-from flytune.reproduction.study import ROLES, Study
+from flytune.reproduction.study import BEHAVIOURS, Study
 from flytune.task.task import Task
 
-Flown = Literal["last", "average"]
-FLOWN: dict[Flown, str] = {"last": "policy-last.safetensors", "average": "policy.safetensors"}
+Weights = Literal["last", "averaged"]  # of the last update, or their moving average
+WEIGHTS_FILES: dict[Weights, str] = {"last": "policy-last.safetensors", "averaged": "policy.safetensors"}
 TRIALS, SEED = 100, 1  # of every evaluation (paper R19)
 SHOWN = 5  # trials in the paper's performance profile (R21)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Condition:
-    """Under which circumstances a policy is flown."""
+class EvaluationSetting:
+    """From where, how long and with which noise a policy is flown."""
 
     name: str
     initial_conditions: InitialConditions
@@ -31,29 +33,30 @@ class Condition:
     text: str
 
 
-CONDITIONS = (
-    Condition(name="printed", initial_conditions="paper", duration=10.0, text="as printed: R19 starts, 10 s"),
-    Condition(
-        name="fair",
+SETTINGS = (
+    EvaluationSetting(name="printed", initial_conditions="paper", duration=10.0, text="as printed: R19 starts, 10 s"),
+    EvaluationSetting(
+        name="fair", initial_conditions="clear", duration=None, text="fair: z0 >= 0.1 m, the task's own duration"
+    ),
+    EvaluationSetting(
+        name="noiseless",
         initial_conditions="clear",
         duration=None,
-        text="fair: z0 >= 0.1 m, as long as the speed bound asks for",
-    ),
-    Condition(
-        name="quiet", initial_conditions="clear", duration=None, noise=False, text="fair, without observation noise"
+        noise=False,
+        text="noiseless: fair, without observation noise",
     ),
 )
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Seat:
-    """What one behaviour flew like under one condition, seed by seed."""
+class Evaluation:
+    """The flights of one behaviour under one setting, judged seed by seed."""
 
     judgements: list[Judgement]
     flights: Flights  # of the first seed
-    rotor_speed: np.ndarray  # [seeds, N] rpm, mean over motors and time
-    progress: np.ndarray  # [seeds, N] share of the starting horizontal distance that was covered at the end
-    distance: np.ndarray  # [seeds, N] m, horizontal, at the start
+    rotor_speed: Float[np.ndarray, "seeds N"]  # rpm, mean over motors and time
+    progress: Float[np.ndarray, "seeds N"]  # share of the initial horizontal distance that was covered at the end
+    distance: Float[np.ndarray, "seeds N"]  # m, horizontal, at the start
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -61,60 +64,60 @@ class Evidence:
     """All that a verdict can rest on."""
 
     study: Study
-    tasks: dict[str, Task]  # by role
-    seats: dict[tuple[str, Flown, str], Seat]  # by role, policy, condition
-    curves: dict[str, list[list[dict[str, Any]]]]  # role -> seed -> rows of metrics.jsonl
+    tasks: dict[str, Task]  # by behaviour
+    evaluations: dict[tuple[str, Weights, str], Evaluation]  # by behaviour, weights, name of the setting
+    curves: dict[str, list[list[dict[str, Any]]]]  # behaviour -> seed -> rows of metrics.jsonl
 
-    def seat(self, role: str, flown: Flown, condition: str = "fair") -> Seat:
-        """What one behaviour flew like."""
-        return self.seats[role, flown, condition]
+    def evaluation(self, behaviour: str, weights: Weights, setting: str = "fair") -> Evaluation:
+        """The flights of one behaviour."""
+        return self.evaluations[behaviour, weights, setting]
 
 
-def gather(study: Study, tell: Callable[[str], None] = lambda line: None) -> Evidence:
-    """Fly every policy of a finished study under every condition.
+def gather_evidence(study: Study, on_message: Callable[[str], None] = lambda line: None) -> Evidence:
+    """The flights of every policy of a finished study under every setting, and the learning curves.
 
-    Start and noise of a trial are the same for every policy, so that trials can be paired.
+    The initial state and the noise of a trial are the same for every policy, so that trials can be paired.
 
     Raises:
         BadInput: a policy is missing or damaged.
-        Diverged: a policy answered with an action that is not finite.
+        Diverged: a policy returned an action that is not finite.
     """
-    tasks = {role: study.task(role) for role in ROLES}
-    seats = {}
-    for role in ROLES:
-        for flown, file in FLOWN.items():
-            for condition in CONDITIONS:
-                paths = [member.directory / file for member in study.members() if member.role == role]
-                seats[role, flown, condition.name] = _fly(paths, tasks[role], condition)
-        tell(f"{study.preset(role)}: flown, {TRIALS} trials a seed under {len(CONDITIONS)} conditions")
-    curves = {
-        role: [_read_rows(member.directory) for member in study.members() if member.role == role] for role in ROLES
-    }
-    return Evidence(study=study, tasks=tasks, seats=seats, curves=curves)
+    tasks = {behaviour: study.task(behaviour) for behaviour in BEHAVIOURS}
+    evaluations, curves = {}, {}
+    for behaviour in BEHAVIOURS:
+        directories = [training.directory for training in study.trainings() if training.behaviour == behaviour]
+        curves[behaviour] = [_read_rows(directory) for directory in directories]
+        for weights, file in WEIGHTS_FILES.items():
+            paths = [directory / file for directory in directories]
+            for setting in SETTINGS:
+                evaluations[behaviour, weights, setting.name] = _fly(paths, tasks[behaviour], setting)
+        on_message(f"{study.preset(behaviour)}: evaluated, {TRIALS} trials of each seed under {len(SETTINGS)} settings")
+    return Evidence(study=study, tasks=tasks, evaluations=evaluations, curves=curves)
 
 
-def _fly(paths: Sequence[Any], task: Task, condition: Condition) -> Seat:
-    silence = {field.name: 0.0 for field in dataclasses.fields(task.noise)}
-    flown = task if condition.noise else dataclasses.replace(task, noise=dataclasses.replace(task.noise, **silence))
+def _fly(paths: Sequence[Path], task: Task, setting: EvaluationSetting) -> Evaluation:
+    if not setting.noise:
+        none = {field.name: 0.0 for field in dataclasses.fields(task.noise)}
+        task = dataclasses.replace(task, noise=dataclasses.replace(task.noise, **none))
     judgements, first, speeds, progress, distance = [], None, [], [], []
     for path in paths:
         flights = fly(
             load_policy(path),
-            flown,
+            task,
             trials=TRIALS,
             seed=SEED,
-            initial_conditions=condition.initial_conditions,
-            duration=condition.duration,
+            initial_conditions=setting.initial_conditions,
+            duration=setting.duration,
             name=f"{path.parent.name}/{path.name}",
         )
         first = first or flights
         judgements.append(judge(flights))
         speeds.append(flights.rotor_speed_rpm[:, 1:].mean(axis=(1, 2)))
-        way = np.linalg.norm((flights.position - flights.target_position)[..., :2], axis=-1)
-        distance.append(way[:, 0])
-        progress.append(1 - way[:, -1] / np.maximum(way[:, 0], 1e-9))
+        left = np.linalg.norm((flights.position - flights.target_position)[..., :2], axis=-1)
+        distance.append(left[:, 0])
+        progress.append(1 - left[:, -1] / np.maximum(left[:, 0], 1e-9))
     assert first is not None, "a study has at least one seed"
-    return Seat(
+    return Evaluation(
         judgements=judgements,
         flights=first,
         rotor_speed=np.array(speeds),
@@ -123,6 +126,6 @@ def _fly(paths: Sequence[Any], task: Task, condition: Condition) -> Seat:
     )
 
 
-def _read_rows(directory: Any) -> list[dict[str, Any]]:
+def _read_rows(directory: Path) -> list[dict[str, Any]]:
     text = (directory / "metrics.jsonl").read_text(encoding="utf-8")
     return [json.loads(line) for line in text.splitlines()]

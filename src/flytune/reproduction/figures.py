@@ -1,7 +1,9 @@
-"""The paper's figures (R21) for paper: matplotlib, as SVG."""
+"""The figures of a reproduction (paper R21), each drawn once, as SVG: for the folder, for the page and for the docs."""
 
+import dataclasses
+import functools
+import io
 from collections.abc import Callable, Sequence
-from pathlib import Path
 from typing import Any
 
 import matplotlib as mpl
@@ -10,16 +12,17 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from flytune.evaluation.judge import Judgement
-from flytune.evaluation.metrics import POSITION_BAND, YAW_BAND
 from flytune.evaluation.table import AXES
 from flytune.report.plots import UNITS, course
-from flytune.reproduction.curves import column
-from flytune.reproduction.evidence import SHOWN, Evidence
-from flytune.reproduction.study import ROLES
+from flytune.reproduction.evidence import SHOWN, Evidence, Weights
+from flytune.reproduction.learning import column
+from flytune.reproduction.study import BEHAVIOURS
 
-COLOURS = dict(zip(ROLES, ("#0b5fa5", "#d1690e", "#12805c"), strict=True))
+COLOURS = dict(zip(BEHAVIOURS, ("#0b5fa5", "#d1690e", "#12805c"), strict=True))
+WIDTH = 4.6  # inches: one column of a paper, and the width of a phone
 STYLE: dict[Any, Any] = {
     "font.size": 8,
+    "figure.labelsize": 8,
     "axes.spines.top": False,
     "axes.spines.right": False,
     "axes.grid": True,
@@ -30,112 +33,113 @@ STYLE: dict[Any, Any] = {
     "svg.fonttype": "none",
     "legend.frameon": False,
 }
-METRICS: dict[str, tuple[str, Callable[[Judgement, str], np.ndarray]]] = {
-    "settling": ("settling time [s]", lambda judged, axis: judged.settling_time[axis]),
-    "overshoot": ("overshoot [% of the step]", lambda judged, axis: 100 * judged.overshoot_raw[axis]),
-    "error": ("steady-state error [mm; deg]", lambda judged, axis: _readable(judged.steady_state_error[axis], axis)),
-}
+Metric = Callable[[Judgement, str], np.ndarray]
 
 
-def write_figures(folder: Path, evidence: Evidence) -> list[Path]:
-    """Write every figure of the paper as SVG, and give their paths.
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class FigureSpec:
+    """One figure: its file name, its place on the page, and what to look at."""
 
-    Last weights throughout, as the paper would have them; starts and durations as printed.
-    """
-    folder.mkdir(parents=True, exist_ok=True)
-    figures = {
-        "reward": _reward,
-        **{name: lambda evidence, name=name: _boxes(evidence, *METRICS[name]) for name in METRICS},
-        "profile": _profile,
-        "rotor-speed": _rotor_speed,
-        "actuation": _actuation,
-    }
-    paths = []
+    name: str
+    section: str
+    title: str
+    caption: str
+    draw: Callable[[Evidence], Figure]
+
+
+def draw_figures(evidence: Evidence) -> dict[str, str]:
+    """Every figure as SVG, by name."""
+    drawn = {}
     with mpl.rc_context(STYLE):
-        for name, draw in figures.items():
-            path = folder / f"{name}.svg"
-            draw(evidence).savefig(path, metadata={"Date": None}, bbox_inches="tight")
-            paths.append(path)
-    return paths
+        for figure in FIGURES:
+            text = io.StringIO()
+            figure.draw(evidence).savefig(text, format="svg", metadata={"Date": None}, bbox_inches="tight")
+            drawn[figure.name] = text.getvalue()
+    return drawn
 
 
-def _canvas(
-    rows: int, columns: int, width: float, height: float, share_time: bool = False
-) -> tuple[Figure, Sequence[Axes]]:
-    figure = Figure(figsize=(width, height), layout="constrained")
+def _canvas(rows: int, columns: int, height: float, share_time: bool = False) -> tuple[Figure, Sequence[Axes]]:
+    figure = Figure(figsize=(WIDTH, height), layout="constrained")
     return figure, list(np.ravel(figure.subplots(rows, columns, squeeze=False, sharex=share_time)))
-
-
-def _readable(values: np.ndarray, axis: str) -> np.ndarray:
-    """Errors in mm or deg; a logarithmic axis begins at a hundredth of either."""
-    return np.maximum(np.degrees(values) if axis == "yaw" else 1e3 * values, 0.01)
 
 
 def _reward(evidence: Evidence) -> Figure:
     """Episode reward over environment steps, mean over seeds with the band from the least to the greatest."""
-    figure, (axes,) = _canvas(1, 1, 4.6, 2.8)
-    for role in ROLES:
-        curves = evidence.curves[role]
+    figure, (axes,) = _canvas(1, 1, 2.8)
+    for behaviour in BEHAVIOURS:
+        curves = evidence.curves[behaviour]
         length = min(map(len, curves))
         steps = column(curves[0], "steps")[:length] / 1e6
         rewards = np.array([column(rows, "episode_reward")[:length] for rows in curves])
         known = np.isfinite(rewards).any(axis=0)
-        mean = np.nanmean(rewards[:, known], axis=0)
-        axes.plot(steps[known], mean, color=COLOURS[role], label=role)
-        low, high = np.nanmin(rewards[:, known], axis=0), np.nanmax(rewards[:, known], axis=0)
-        axes.fill_between(steps[known], low, high, color=COLOURS[role], alpha=0.18, linewidth=0)
+        low, mean, high = (of(rewards[:, known], axis=0) for of in (np.nanmin, np.nanmean, np.nanmax))
+        axes.plot(steps[known], mean, color=COLOURS[behaviour], label=behaviour)
+        axes.fill_between(steps[known], low, high, color=COLOURS[behaviour], alpha=0.18, linewidth=0)
     axes.set_xlabel("environment steps [millions]")
     axes.set_ylabel("episode reward")
     axes.legend(loc="lower right")
     return figure
 
 
-def _boxes(evidence: Evidence, label: str, of: Callable[[Judgement, str], np.ndarray]) -> Figure:
-    """Boxes per axis and behaviour over all seeds and trials; beneath each, how many trials it shows."""
-    figure, panels = _canvas(1, len(AXES), 7.2, 2.6)
+def _boxes(
+    evidence: Evidence,
+    metric: Metric,
+    label: str,
+    *,
+    weights: Weights = "last",
+    setting: str,
+    logarithmic: bool = False,
+) -> Figure:
+    """Boxes per axis and behaviour over all seeds and trials; above each, the share of the trials that it shows."""
+    figure, panels = _canvas(2, 2, 4.0)
     for axes, axis in zip(panels, AXES, strict=True):
-        for place, role in enumerate(ROLES):
-            judged = evidence.seat(role, "last", "printed").judgements
-            values = np.concatenate([of(judgement, axis) for judgement in judged])
-            known = values[np.isfinite(values)]
-            axes.boxplot(
-                [known],
-                positions=[place],
-                widths=0.6,
-                showfliers=False,
-                patch_artist=True,
-                boxprops={"facecolor": COLOURS[role], "alpha": 0.35, "linewidth": 0.6},
-                medianprops={"color": COLOURS[role], "linewidth": 1.4},
-                whiskerprops={"linewidth": 0.6},
-                capprops={"linewidth": 0.6},
-            )
-            share = f"{known.size / values.size:.0%}"
+        for place, behaviour in enumerate(BEHAVIOURS):
+            judged = evidence.evaluation(behaviour, weights, setting).judgements
+            values = np.concatenate([metric(judgement, axis) for judgement in judged])
+            share = f"{_box(axes, values, place, COLOURS[behaviour]):.0%}"
             axes.annotate(share, (place, 1.0), xycoords=("data", "axes fraction"), ha="center", va="bottom", fontsize=6)
-        axes.set_xticks(range(len(ROLES)), [role[:5] + "." for role in ROLES])
         axes.set_title(axis, pad=12)
-        if label.startswith("steady-state"):  # from millimetres to metres
+        if logarithmic:
             axes.set_yscale("log")
         else:
             axes.set_ylim(bottom=0)
-    panels[0].set_ylabel(label)
+    figure.supylabel(label)
     return figure
+
+
+def _box(axes: Axes, values: np.ndarray, place: int, colour: str) -> float:
+    """Draw the box of the finite values of a behaviour; the share that they are of all."""
+    known = values[np.isfinite(values)]
+    axes.boxplot(
+        [known],
+        positions=[place],
+        widths=0.6,
+        showfliers=False,
+        patch_artist=True,
+        boxprops={"facecolor": colour, "alpha": 0.35, "linewidth": 0.6},
+        medianprops={"color": colour, "linewidth": 1.4},
+        whiskerprops={"linewidth": 0.6},
+        capprops={"linewidth": 0.6},
+    )
+    axes.set_xticks(range(len(BEHAVIOURS)), BEHAVIOURS, fontsize=7)
+    axes.set_xlim(-0.6, len(BEHAVIOURS) - 0.4)
+    return known.size / values.size
 
 
 def _profile(evidence: Evidence) -> Figure:
     """x, y, z and yaw against time for the first five tests, three behaviours overlaid, first seed."""
-    figure, panels = _canvas(2, 2, 7.2, 4.4, share_time=True)
+    figure, panels = _canvas(2, 2, 3.8, share_time=True)
     for axes, axis in zip(panels, AXES, strict=True):
-        target = 0.0
-        for role in ROLES:
-            flights = evidence.seat(role, "last", "printed").flights
-            values, target, _ = course(flights, axis)
-            lines = axes.plot(flights.time, values[:SHOWN].T, color=COLOURS[role], linewidth=0.8)
-            lines[0].set_label(role)
-        band = POSITION_BAND if axis != "yaw" else np.degrees(YAW_BAND)
+        target = band = 0.0
+        for behaviour in BEHAVIOURS:
+            flights = evidence.evaluation(behaviour, "last", "printed").flights
+            values, target, band = course(flights, axis)
+            lines = axes.plot(flights.time, values[:SHOWN].T, color=COLOURS[behaviour], linewidth=0.8)
+            lines[0].set_label(behaviour)
         axes.axhspan(target - band, target + band, color="#12805c", alpha=0.15, linewidth=0)
         axes.axhline(target, color="#1f2933", linewidth=0.6, linestyle="--")
         axes.set_ylabel(f"{axis} [{UNITS[axis]}]")
-    panels[0].legend(loc="best")
+    figure.legend(*panels[0].get_legend_handles_labels(), loc="outside upper center", ncols=len(BEHAVIOURS))
     for axes in panels[2:]:
         axes.set_xlabel("time [s]")
     return figure
@@ -143,11 +147,11 @@ def _profile(evidence: Evidence) -> Figure:
 
 def _rotor_speed(evidence: Evidence) -> Figure:
     """Rotor speed, mean over four motors and five tests, against time: what the paper draws (C6)."""
-    figure, (axes,) = _canvas(1, 1, 4.6, 2.6)
-    for role in ROLES:
-        flights = evidence.seat(role, "last", "printed").flights
+    figure, (axes,) = _canvas(1, 1, 2.6)
+    for behaviour in BEHAVIOURS:
+        flights = evidence.evaluation(behaviour, "last", "printed").flights
         speed = flights.rotor_speed_rpm[:SHOWN, 1:].mean(axis=(0, 2))
-        axes.plot(flights.time[1:], speed, color=COLOURS[role], linewidth=0.8, label=role)
+        axes.plot(flights.time[1:], speed, color=COLOURS[behaviour], linewidth=0.8, label=behaviour)
     axes.set_xlabel("time [s]")
     axes.set_ylabel("mean rotor speed [rpm]")
     axes.legend(loc="best")
@@ -156,16 +160,107 @@ def _rotor_speed(evidence: Evidence) -> Figure:
 
 def _actuation(evidence: Evidence) -> Figure:
     """RMS and total variation of the action over all seeds and trials: what tells controllers apart (C6)."""
-    figure, panels = _canvas(1, 2, 5.2, 2.6)
+    figure, panels = _canvas(1, 2, 2.6)
     measured = (("RMS of the action [1]", "action_rms"), ("total variation [1 per step]", "action_total_variation"))
     for axes, (label, name) in zip(panels, measured, strict=True):
-        for place, role in enumerate(ROLES):
-            judged = evidence.seat(role, "last", "printed").judgements
-            values = np.concatenate([getattr(judgement, name) for judgement in judged])
-            axes.boxplot([values[np.isfinite(values)]], positions=[place], widths=0.6, showfliers=False,
-                         patch_artist=True, boxprops={"facecolor": COLOURS[role], "alpha": 0.35, "linewidth": 0.6},
-                         medianprops={"color": COLOURS[role], "linewidth": 1.4})  # fmt: skip
-        axes.set_xticks(range(len(ROLES)), [role[:5] + "." for role in ROLES])
+        for place, behaviour in enumerate(BEHAVIOURS):
+            judged = evidence.evaluation(behaviour, "last", "printed").judgements
+            _box(axes, np.concatenate([getattr(judgement, name) for judgement in judged]), place, COLOURS[behaviour])
         axes.set_ylabel(label)
         axes.set_ylim(bottom=0)
     return figure
+
+
+def _settling_time(judged: Judgement, axis: str) -> np.ndarray:
+    return judged.settling_time[axis]
+
+
+def _overshoot(judged: Judgement, axis: str) -> np.ndarray:
+    return 100 * judged.overshoot_raw[axis]
+
+
+def _error(judged: Judgement, axis: str) -> np.ndarray:
+    """Errors in mm or deg; the logarithmic axis begins at a hundredth of either."""
+    error = judged.steady_state_error[axis]
+    return np.maximum(np.degrees(error) if axis == "yaw" else 1e3 * error, 0.01)
+
+
+def _metrics(suffix: str, section: str, setting: str) -> list[FigureSpec]:
+    """The three figures of metrics under one setting."""
+    settling = functools.partial(_boxes, metric=_settling_time, label="settling time [s]", setting=setting)
+    overshoot = functools.partial(_boxes, metric=_overshoot, label="overshoot [% of the step]", setting=setting)
+    error = functools.partial(
+        _boxes, metric=_error, label="steady-state error [mm; deg]", setting=setting, logarithmic=True
+    )
+    return [
+        FigureSpec(
+            name=f"settling{suffix}",
+            section=section,
+            title="Settling time",
+            caption="Only trials that settle are in a box; the percentage above it says how many these are. A low box "
+            "of few trials is no success.",
+            draw=settling,
+        ),
+        FigureSpec(
+            name=f"overshoot{suffix}",
+            section=section,
+            title="Overshoot",
+            caption="Raw overshoot: excursions that stay inside the settling band count. Trials with a small step have "
+            "no overshoot.",
+            draw=overshoot,
+        ),
+        FigureSpec(
+            name=f"error{suffix}",
+            section=section,
+            title="Steady-state error",
+            caption="Distance of the mean of the last two seconds from the target, on each axis. The scale is "
+            "logarithmic.",
+            draw=error,
+        ),
+    ]
+
+
+FIGURES = [
+    FigureSpec(
+        name="reward",
+        section="Learning",
+        title="Episode reward",
+        caption="The line is the mean over seeds, the band reaches from the worst seed to the best. The rewards of "
+        "different behaviours are not on one scale: the terms of inspection add up to less.",
+        draw=_reward,
+    ),
+    *_metrics("", "Metrics as printed", "printed"),
+    *_metrics("-fair", "Metrics under the fair setting", "fair"),
+    FigureSpec(
+        name="profile",
+        section="Performance profile and motors",
+        title="Performance profile",
+        caption="The first five trials of the first seed, from the same starts and with the same noise for each "
+        "behaviour. The green band is the settling band.",
+        draw=_profile,
+    ),
+    FigureSpec(
+        name="rotor-speed",
+        section="Performance profile and motors",
+        title="Mean rotor speed",
+        caption="What the paper draws. The mean of every controller that hovers is the hover speed (C6).",
+        draw=_rotor_speed,
+    ),
+    FigureSpec(
+        name="actuation",
+        section="Performance profile and motors",
+        title="Action",
+        caption="RMS and total variation of the action over all seeds and trials. These tell controllers apart (C6).",
+        draw=_actuation,
+    ),
+    FigureSpec(
+        name="settling-averaged",
+        section="Averaged weights",
+        title="Settling time with averaged weights",
+        caption="The same as the settling time under the fair setting, with the weights averaged over updates. "
+        "Verdicts rest on the weights of the last update.",
+        draw=functools.partial(
+            _boxes, metric=_settling_time, label="settling time [s]", weights="averaged", setting="fair"
+        ),
+    ),
+]

@@ -1,155 +1,164 @@
-"""The page of a reproduction: verdicts, figures, tables, and how each number came to be."""
+"""What a reproduction shows: the verdicts as a page, as Markdown and in a terminal, from the same tables."""
 
-import math
-from collections.abc import Sequence
+import base64
+from collections import Counter
+from collections.abc import Mapping, Sequence
 from html import escape
-from pathlib import Path
+from typing import get_args
 
-from flytune.config.files import check_file, write_text
-from flytune.report import page, plots, tables
-from flytune.reproduction import drawings
-from flytune.reproduction.evidence import CONDITIONS, SEED, TRIALS, Evidence
-from flytune.reproduction.inconsistencies import Point
-from flytune.reproduction.study import ROLES
-from flytune.reproduction.verdict import Measure, Verdict
+from flytune.report import page, tables
+from flytune.reproduction.evidence import SEED, SETTINGS, TRIALS, WEIGHTS_FILES, Evidence
+from flytune.reproduction.figures import FIGURES, FigureSpec
+from flytune.reproduction.inconsistencies import Inconsistency
+from flytune.reproduction.study import BEHAVIOURS
+from flytune.reproduction.verdict import JudgedClaim, Measure, Verdict
 
-LENGTH = dict.fromkeys("xyz", ("mm", 1000.0)) | {"yaw": ("deg", math.degrees(1))}
-
-
-def write_page(path: Path, evidence: Evidence, verdicts: Sequence[Verdict], points: Sequence[Point]) -> None:
-    """Write the page of a reproduction, whole or not at all.
-
-    Raises:
-        BadInput: the file cannot be written.
-    """
-    check_file(path)
-    write_text(path, page.page("flytune: the paper, reproduced", _body(evidence, verdicts, points)))
+MARKS = {True: "yes", False: "no", None: ""}
+COLOURS: dict[str, str] = dict(zip(get_args(Verdict), ("holds", "reading", "fails", "untestable"), strict=True))
+PLURAL: dict[Verdict, str] = {
+    "holds": "hold",
+    "holds under a reading": "hold under a reading",
+    "does not hold": "do not hold",
+    "cannot be tested as printed": "cannot be tested as printed",
+}
+Table = tuple[Sequence[str], Sequence[Sequence[str]]]
 
 
-def verdict_table(verdicts: Sequence[Verdict]) -> list[tuple[str, str, str, str]]:
-    """Item, claim, verdict and reading of every claim, as texts."""
-    return [(verdict.item, verdict.claim, verdict.word, verdict.reading) for verdict in verdicts]
+def summary(claims: Sequence[JudgedClaim]) -> str:
+    """How many claims there are of each verdict, in one sentence."""
+    counts = Counter(claim.verdict for claim in claims)
+    parts = [f"{counts[verdict]} {verdict if counts[verdict] == 1 else PLURAL[verdict]}" for verdict in PLURAL]
+    return f"Of {len(claims)} claims, {', '.join(parts[:-1])} and {parts[-1]}."
 
 
-def _body(evidence: Evidence, verdicts: Sequence[Verdict], points: Sequence[Point]) -> str:
-    parts = {
-        "Verdicts": _verdicts(verdicts),
-        "Learning": page.drawing(drawings.reward(evidence), _CAPTIONS["reward"]),
-        "Metrics, as printed": _boxes(evidence, "printed"),
-        "Metrics, under fair conditions": _boxes(evidence, "fair"),
-        "Performance profile": page.drawing(drawings.profile(evidence, "last", "printed"), _CAPTIONS["profile"]),
-        "Motors": page.drawing(drawings.rotor_speed(evidence, "last", "printed"), _CAPTIONS["motors"]),
-        "Every claim": "".join(map(_claim, verdicts)),
-        "Where it cannot hold as printed": "".join(map(_point, points)),
-        "Every seed": _seeds(evidence),
-        "Averaged weights": page.drawing(
-            plots.settled_share(
-                [
-                    (f"{role}, {flown}", evidence.seat(role, flown).judgements[0])
-                    for role in ROLES
-                    for flown in ("last", "average")
-                ]
-            ),
-            _CAPTIONS["average"],
-        ),
-    }
-    links = "".join(f'<a href="#s{number}">{name}</a>' for number, name in enumerate(parts))
-    body = "".join(f'<h2 id="s{number}">{name}</h2>{html}' for number, (name, html) in enumerate(parts.items()))
-    study = evidence.study
-    steps = "the task's own steps" if study.steps is None else f"{study.steps:,} steps"
-    conditions = "; ".join(condition.text for condition in CONDITIONS)
-    lead = (
-        f"{', '.join(study.preset(role) for role in ROLES)}: {study.seeds} seeds of each, trainer {study.trainer}, "
-        f"{steps}. Every policy flew {TRIALS} trials with start and noise seed {SEED} under {len(CONDITIONS)} "
-        f"conditions ({conditions})."
+def verdict_table(claims: Sequence[JudgedClaim]) -> Table:
+    """Item, claim, verdict and reading of every claim."""
+    rows = [(claim.item, claim.claim, claim.verdict, claim.reading) for claim in claims]
+    return ("item", "claim", "verdict", "reading"), rows
+
+
+def measure_table(measures: Sequence[Measure], title: str = "measured") -> Table:
+    """The numbers behind a verdict, and whether each agrees with the claim."""
+    rows = [(measure.what, measure.text(), MARKS[measure.agrees]) for measure in measures]
+    return (title, "value [95 % interval]", "agrees"), rows
+
+
+def markdown(claims: Sequence[JudgedClaim], inconsistencies: Sequence[Inconsistency]) -> str:
+    """Everything that was measured: the verdicts, each claim with its numbers, and the inconsistencies."""
+    parts = ["## Verdicts", summary(claims), _markdown(verdict_table(claims)), "## Every claim"]
+    for claim in claims:
+        parts += [f"### {claim.item}: {claim.verdict}", f"{claim.claim} {claim.why}"]
+        parts += [_markdown(measure_table(claim.measures))]
+        if claim.averaged:
+            parts += ["Averaged weights, without a verdict:", _markdown(measure_table(claim.averaged))]
+    parts.append("## Where the paper is inconsistent as printed")
+    for each in inconsistencies:
+        parts += [f"### {each.item}", each.text, _markdown(measure_table(each.measures))]
+    return "\n\n".join(part for part in parts if part) + "\n"
+
+
+def html(
+    evidence: Evidence,
+    claims: Sequence[JudgedClaim],
+    inconsistencies: Sequence[Inconsistency],
+    figures: Mapping[str, str],
+) -> str:
+    """The page of a reproduction, with its figures (SVG by name) inside."""
+    sections = {"Verdicts": _html(verdict_table(claims)) + f'<p class="quiet">{VERDICTS}</p>'}
+    for spec in FIGURES:
+        sections[spec.section] = sections.get(spec.section, "") + _figure(spec, figures[spec.name])
+    sections["Every claim"] = "".join(map(_claim, claims))
+    sections["Where the paper is inconsistent as printed"] = "".join(
+        f"<h3>{each.item}</h3><p>{escape(each.text)}</p>{_html(measure_table(each.measures))}"
+        for each in inconsistencies
     )
-    return f'<h1>The paper, reproduced</h1><p class="quiet">{escape(lead)}</p><nav>{links}</nav>{body}'
+    sections["Every seed"] = tables.comparison_table(
+        [
+            ("s0", f"{behaviour} seed {seed}, {weights}", judgement)
+            for behaviour in BEHAVIOURS
+            for weights in WEIGHTS_FILES
+            for seed, judgement in enumerate(evidence.evaluation(behaviour, weights).judgements)
+        ]
+    )
+    links = "".join(f'<a href="#s{number}">{name}</a>' for number, name in enumerate(sections))
+    body = "".join(
+        f'<h2 id="s{number}">{name}</h2><div class="figures">{html}</div>'
+        for number, (name, html) in enumerate(sections.items())
+    )
+    return page.page(
+        "flytune: the paper, reproduced",
+        f'<style>{STYLE}</style><h1>The paper, reproduced</h1><p class="lead">{summary(claims)}</p>'
+        f'<p class="quiet">{escape(_about(evidence))}</p><nav>{links}</nav>{body}',
+    )
 
 
-def _verdicts(verdicts: Sequence[Verdict]) -> str:
-    head = "<tr><th>item</th><th>claim</th><th>verdict</th><th>reading</th></tr>"
-    rows = [tuple(map(escape, row)) for row in verdict_table(verdicts)]
-    return f'<div class="words">{tables.table(head, rows)}</div>{_CAPTIONS["verdicts"]}'
+def _about(evidence: Evidence) -> str:
+    """What was trained and how it was flown."""
+    study = evidence.study
+    steps = "the task's own number of steps" if study.steps is None else f"{study.steps:,} steps"
+    settings = "; ".join(setting.text for setting in SETTINGS)
+    return (
+        f"{', '.join(map(study.preset, BEHAVIOURS))}: {study.seeds} seeds of each, trainer {study.trainer}, {steps}. "
+        f"Every policy flew {TRIALS} trials with seed {SEED} under {len(SETTINGS)} settings ({settings})."
+    )
 
 
-def _claim(verdict: Verdict) -> str:
+def _figure(spec: FigureSpec, svg: str) -> str:
+    """The figure as an image that the page carries, so that the ids of two figures cannot meet."""
+    data = base64.b64encode(svg.encode()).decode()
+    return (
+        f'<figure><h3>{escape(spec.title)}</h3><img src="data:image/svg+xml;base64,{data}" '
+        f'alt="{escape(spec.title)}"><figcaption>{escape(spec.caption)}</figcaption></figure>'
+    )
+
+
+def _claim(claim: JudgedClaim) -> str:
     parts = [
-        f"<h3>{escape(verdict.item)}: {escape(verdict.word)}</h3><p><strong>{escape(verdict.claim)}</strong> "
-        f"{escape(verdict.why)} Reading: {escape(verdict.reading)}</p>",
-        _measures(verdict.measures, "last weights"),
+        f"<h3>{escape(claim.item)}: {_coloured(claim.verdict)}</h3><p><strong>{escape(claim.claim)}</strong> "
+        f"{escape(claim.why)} Reading: {escape(claim.reading)}</p>",
+        _html(measure_table(claim.measures, "last weights")),
     ]
-    if verdict.average:
-        parts.append(_measures(verdict.average, "averaged weights, without a verdict"))
+    if claim.averaged:
+        parts.append(_html(measure_table(claim.averaged, "averaged weights, without a verdict")))
     return "".join(parts)
 
 
-def _point(point: Point) -> str:
-    return f"<h3>{point.item}</h3><p>{escape(point.text)}</p>{_measures(point.measures, 'measured')}"
+def _coloured(cell: str) -> str:
+    return f'<span class="{COLOURS[cell]}">{escape(cell)}</span>' if cell in COLOURS else escape(cell)
 
 
-def _measures(measures: Sequence[Measure], title: str) -> str:
-    if not measures:
+def _html(table: Table) -> str:
+    head, rows = table
+    if not rows:
         return ""
-    marks = {True: "yes", False: "no", None: ""}
-    head = f"<tr><th>{escape(title)}</th><th>value [95 % interval]</th><th>agrees</th></tr>"
-    rows = [(escape(m.what), escape(m.text()), marks[m.agrees]) for m in measures]
-    return f'<div class="words">{tables.table(head, rows)}</div>'
-
-
-def _boxes(evidence: Evidence, condition: str) -> str:
-    settling = drawings.boxes(
-        evidence, "last", condition, lambda axis: ("s", 1.0), lambda judged, axis: judged.settling_time[axis]
-    )
-    overshoot = drawings.boxes(
-        evidence,
-        "last",
-        condition,
-        lambda axis: ("% of the step", 100.0),
-        lambda judged, axis: judged.overshoot_raw[axis],
-    )
-    error = drawings.boxes(
-        evidence,
-        "last",
-        condition,
-        LENGTH.__getitem__,
-        lambda judged, axis: judged.steady_state_error[axis],
-        logarithmic=True,
-    )
+    cells = "".join(f"<th>{escape(name)}</th>" for name in head)
     return (
-        f"<h3>Settling time</h3>{page.drawing(settling, _CAPTIONS['settling'])}"
-        f"<h3>Overshoot</h3>{page.drawing(overshoot, _CAPTIONS['overshoot'])}"
-        f"<h3>Steady-state error</h3>{page.drawing(error, _CAPTIONS['error'])}"
+        f'<div class="words">{tables.table(f"<tr>{cells}</tr>", [[_coloured(cell) for cell in row] for row in rows])}'
+        "</div>"
     )
 
 
-def _seeds(evidence: Evidence) -> str:
-    judged = [
-        ("s0", f"{role} seed {seed}, {flown}", judgement)
-        for role in ROLES
-        for flown in ("last", "average")
-        for seed, judgement in enumerate(evidence.seat(role, flown).judgements)
-    ]
-    return tables.comparison_table(judged)
+def _markdown(table: Table) -> str:
+    head, rows = table
+    if not rows:
+        return ""
+    lines = [head, ["---"] * len(head), *rows]
+    return "\n".join(f"| {' | '.join(cell.replace('|', '/') for cell in line)} |" for line in lines)
 
 
-_CAPTIONS = {
-    "verdicts": """
-<p class="quiet">A claim holds where it holds in the strict sense of its words; it holds under a reading where it holds
-only once an undefined word is given the meaning in the last column. Readings and thresholds were fixed before anything
-was measured: a claim about trials needs the lower end of the 95&nbsp;% interval over seeds and trials at 95&nbsp;%.
-Verdicts rest on the weights of the last update.</p>""",
-    "reward": """
-Mean over seeds, and the band from the worst to the best of them. The rewards of different behaviours are not on one
-scale: inspection's terms add up to less.""",
-    "settling": """
-Trials that settle; under each box how many these are. A low box over a small number is no success.""",
-    "overshoot": "Raw: also excursions that stay inside the settling band. Small steps have none.",
-    "error": "Distance of the mean of the last two seconds from the target, on each axis; the axis is logarithmic.",
-    "profile": "The first five tests of the first seed, the same starts and noise for each; green is the band.",
-    "motors": """
-Left, what the paper draws: every controller that hovers has the hover speed in the mean (C6). Right, what tells them
-apart.""",
-    "average": """
-First seed of each behaviour, fair conditions: the last weights, which the verdicts rest on, beside the weights averaged
-over updates.""",
-}
+VERDICTS = (
+    "A claim holds where it holds in the strict sense of its words. It holds under a reading where it holds only once "
+    "an undefined word is given the meaning in the last column. Readings and thresholds were fixed before anything was "
+    "measured: a claim about trials needs the lower end of the 95 % interval over seeds and trials at 95 %. Verdicts "
+    "rest on the weights of the last update."
+)
+STYLE = """
+.figures { display: grid; grid-template-columns: repeat(auto-fit, minmax(min(100%, 440px), 1fr)); gap: 0 32px; }
+.figures > :not(figure) { grid-column: 1 / -1; }
+figure img { width: 100%; max-width: 620px; height: auto; }
+.holds, .reading, .fails, .untestable { padding: 1px 8px; border-radius: 9px; white-space: nowrap; font-weight: 600; }
+.holds { background: #d5eedd; color: #0b5132; }
+.reading { background: #fdf0c8; color: #6b4a00; }
+.fails { background: #fbdcd8; color: #8a1c13; }
+.untestable { background: #e4e7eb; color: #3e4c59; }
+"""

@@ -1,4 +1,4 @@
-"""A study: the trainings a reproduction is made of, and where each of them stands on disk."""
+"""A study: the trainings that a reproduction is made of, and how far each of them is on disk."""
 
 import dataclasses
 import json
@@ -15,16 +15,16 @@ from flytune.runs.directory import first_difference, has_checkpoint, read_facts
 from flytune.task.task import Task, load_task
 from flytune.training.trainer import find_trainer
 
-ROLES = ("baseline", "acrobatic", "inspection")
-CONDITION = Literal["new", "begun", "done"]
+BEHAVIOURS = ("baseline", "acrobatic", "inspection")  # of the paper
+TrainingStatus = Literal["new", "interrupted", "finished"]
 SCHEMA = 1
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Member:
+class Training:
     """One training of a study."""
 
-    role: str  # which of the paper's three behaviours
+    behaviour: str
     preset: str
     seed: int
     directory: Path
@@ -44,41 +44,41 @@ class Study:
         find_trainer(self.trainer, every_task=True)
         if not 1 <= self.seeds <= 100:
             raise BadInput(f"seeds: {self.seeds} is not allowed. Allowed: a whole number, 1 to 100.")
-        for role in ROLES:
-            self.task(role)
+        for behaviour in BEHAVIOURS:
+            self.task(behaviour)
 
-    def preset(self, role: str) -> str:
+    def preset(self, behaviour: str) -> str:
         """The task that stands for one of the three behaviours."""
-        return f"{role}-refined" if self.refined else role
+        return f"{behaviour}-refined" if self.refined else behaviour
 
-    def task(self, role: str) -> Task:
-        """What is trained and flown, with the number of steps the study asks for."""
-        task = load_task(self.preset(role))
+    def task(self, behaviour: str) -> Task:
+        """The task that is trained and flown, with the number of steps that the study asks for."""
+        task = load_task(self.preset(behaviour))
         return task if self.steps is None else find_trainer(self.trainer).with_steps(task, self.steps)
 
-    def members(self) -> list[Member]:
+    def trainings(self) -> list[Training]:
         """Every training, seed by seed, so that each behaviour has its first policy early."""
         return [
-            Member(
-                role=role,
-                preset=self.preset(role),
+            Training(
+                behaviour=behaviour,
+                preset=self.preset(behaviour),
                 seed=seed,
-                directory=self.folder / "runs" / f"{self.preset(role)}-{self.trainer}-s{seed}",
+                directory=self.folder / "runs" / f"{self.preset(behaviour)}-{self.trainer}-s{seed}",
             )
             for seed in range(self.seeds)
-            for role in ROLES
+            for behaviour in BEHAVIOURS
         ]
 
     def plan(self) -> dict[str, Any]:
-        """What makes two studies the same one; more seeds only add to it."""
+        """What two studies must have in common to be the same study; the number of seeds may grow."""
         return {"schema": SCHEMA, "trainer": self.trainer, "steps": self.steps, "refined": self.refined}
 
 
 def open_study(study: Study) -> None:
-    """Make the study's folder, or take up the one that is there.
+    """Make the study's folder, or accept the one that is there.
 
     Raises:
-        BadInput: the folder holds another study or something else, or cannot be written; nothing was changed.
+        BadInput: the folder holds another study or something else, or cannot be written. Nothing was changed.
     """
     path = study.folder / "reproduction.json"
     if study.folder.exists() and not study.folder.is_dir():
@@ -100,39 +100,39 @@ def open_study(study: Study) -> None:
     write_json(path, study.plan())
 
 
-def condition(study: Study, member: Member, tell: Callable[[str], None]) -> CONDITION:
-    """How far a training is: `new`, `begun` (it goes on from its checkpoint) or `done`.
+def training_status(study: Study, training: Training, on_message: Callable[[str], None]) -> TrainingStatus:
+    """How far a training is; an interrupted one has a checkpoint to continue from.
 
-    A directory that cannot be used is kept under another name, and said so; one that never came to a checkpoint
-    holds nothing and is removed.
+    A directory that cannot be used is kept under another name, and a message says so. A directory without a
+    checkpoint holds nothing and is removed.
 
     Raises:
         BadInput: the directory holds the training of another task.
     """
-    here = member.directory
-    if not here.exists():
+    directory = training.directory
+    if not directory.exists():
         return "new"
     try:
-        facts = read_facts(here)
-        task = load_task(here / "task.toml")
+        facts = read_facts(directory)
+        task = load_task(directory / "task.toml")
         if facts.get("finished"):
-            load_policy(here / "policy.safetensors")
-            load_policy(here / "policy-last.safetensors")
+            load_policy(directory / "policy.safetensors")
+            load_policy(directory / "policy-last.safetensors")
     except BadInput as error:
-        aside = _free_name(here)
-        here.rename(aside)
-        tell(f"{here.name}: damaged, kept as {aside.name} and trained again ({error})")
+        aside = _free_name(directory)
+        directory.rename(aside)
+        on_message(f"{directory.name}: damaged, kept as {aside.name} and trained again ({error})")
         return "new"
-    if path := first_difference(document.plain(task), document.plain(study.task(member.role))):
+    if path := first_difference(document.plain(task), document.plain(study.task(training.behaviour))):
         raise BadInput(
-            f"{here}: was trained with another {path} than {member.preset} has now. Give another directory, or move "
-            "this one away."
+            f"{directory}: was trained with another {path} than {training.preset} has now. Give another directory, or "
+            "move this one away."
         )
     if facts.get("finished"):
-        return "done"
-    if has_checkpoint(here):
-        return "begun"
-    shutil.rmtree(here)
+        return "finished"
+    if has_checkpoint(directory):
+        return "interrupted"
+    shutil.rmtree(directory)
     return "new"
 
 

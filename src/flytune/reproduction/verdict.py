@@ -1,62 +1,63 @@
-"""What a verdict is, and the arithmetic every claim is judged with."""
+"""Verdicts on claims, and the arithmetic by which every claim is judged."""
 
 import dataclasses
 from collections.abc import Sequence
 from typing import Any, Literal
 
 import numpy as np
+from jaxtyping import Shaped
 
-from flytune.evaluation.statistics import bootstrap_interval, finite
+from flytune.evaluation.statistics import bootstrap_interval, median
 
-Word = Literal["holds", "holds under a reading", "does not hold", "cannot be tested as printed"]
+Verdict = Literal["holds", "holds under a reading", "does not hold", "cannot be tested as printed"]
 
 # Fixed before anything was measured: a claim about trials holds where the lower end of the interval of the share of
 # trials that agree with it reaches this.
-SHARE = 0.95
+THRESHOLD = 0.95
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Measure:
-    """One number a verdict rests on, with its 95 % interval over seeds and trials."""
+    """One number that a verdict rests on, with its 95 % interval over seeds and trials."""
 
     what: str
     value: float | None  # None: infinite, or nothing to measure
     low: float | None = None
     high: float | None = None
     unit: str = "1"
-    agrees: bool | None = None  # with the claim; None where it only informs
+    agrees: bool | None = None  # with the claim; None where the number only informs
 
     def text(self) -> str:
-        """The number as a reader wants it."""
-        if self.unit == "share":
-            number, low, high = (_percent(part) for part in (self.value, self.low, self.high))
-        else:
-            number, low, high = (_plain(part) for part in (self.value, self.low, self.high))
+        """The number with its unit and its interval."""
+        write = _percent if self.unit == "share" else _plain
+        number, low, high = map(write, (self.value, self.low, self.high))
         interval = "" if self.low is None and self.high is None else f" [{low}, {high}]"
         return f"{number}{'' if self.unit in ('share', '1') else ' ' + self.unit}{interval}"
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Verdict:
-    """What became of one claim."""
+class JudgedClaim:
+    """One claim of the paper, its verdict, and the numbers behind it."""
 
-    item: str  # R23, H7, C1
+    item: str  # R23, H7
     claim: str
-    word: Word
-    reading: str  # the definition the verdict rests on
+    verdict: Verdict
+    reading: str  # the definition that the verdict rests on
     why: str  # one sentence
     measures: list[Measure]
-    average: list[Measure] = dataclasses.field(default_factory=list)  # the same of the averaged weights
+    averaged: list[Measure] = dataclasses.field(default_factory=list)  # the same of the averaged weights
 
     def to_dict(self) -> dict[str, Any]:
         """Plain values, for JSON."""
         return dataclasses.asdict(self)
 
 
-def share(what: str, agreeing: Sequence[np.ndarray], threshold: float | None = SHARE) -> Measure:
+def share_of_trials(
+    what: str, agreeing: Sequence[Shaped[np.ndarray, "N"]], threshold: float | None = THRESHOLD
+) -> Measure:
     """The share of trials [seeds][trials] (bool) that agree with a claim.
 
-    It agrees where the lower end of its interval reaches `threshold`; without one it only informs.
+    It agrees where the lower end of its interval reaches `threshold`; without a threshold it only informs.
     """
     values = [np.asarray(group, float) for group in agreeing if len(group)]
     if not values:
@@ -67,19 +68,18 @@ def share(what: str, agreeing: Sequence[np.ndarray], threshold: float | None = S
     return Measure(what=what, value=value, low=low, high=high, unit="share", agrees=agrees)
 
 
-def middle(what: str, values: Sequence[np.ndarray], unit: str, at_most: float | None = None) -> Measure:
-    """The median of per-trial values [seeds][trials], and whether the upper end of its interval is within `at_most`."""
+def median_of_trials(what: str, values: Sequence[Shaped[np.ndarray, "N"]], unit: str) -> Measure:
+    """The median of per-trial values [seeds][trials], which only informs."""
     low, high = bootstrap_interval(values)
-    known = np.sort(np.concatenate(values))
-    known = known[~np.isnan(known)]
-    value = finite(known[int(np.ceil(0.5 * known.size)) - 1]) if known.size else None
-    agrees = None if at_most is None else high is not None and high <= at_most
-    return Measure(what=what, value=value, low=low, high=high, unit=unit, agrees=agrees)
+    return Measure(what=what, value=median(np.concatenate(values)), low=low, high=high, unit=unit)
 
 
-def decide(printed: Sequence[Measure], reading: Sequence[Measure] = ()) -> Word:
-    """`holds` where every measure taken as printed agrees, `holds under a reading` where every one of the reading's
-    does, `does not hold` elsewhere."""
+def decide(printed: Sequence[Measure], reading: Sequence[Measure] = ()) -> Verdict:
+    """The verdict that the measures of a claim lead to.
+
+    `holds` where every measure taken as printed agrees, `holds under a reading` where every measure of the reading
+    does, `does not hold` otherwise.
+    """
     if printed and all(measure.agrees for measure in printed):
         return "holds"
     if reading and all(measure.agrees for measure in reading):

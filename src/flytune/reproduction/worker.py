@@ -1,6 +1,6 @@
 """One training of a study in a process of its own: `python -m flytune.reproduction.worker '{...}'`.
 
-It tells how far it is on standard output, one JSON object per line, and ends with the exit codes of the command line.
+It writes its progress to standard output, one JSON object per line, and ends with the exit codes of the command line.
 """
 
 import dataclasses
@@ -12,7 +12,7 @@ from pathlib import Path
 
 from flytune.errors import FlytuneError
 
-INTERVAL = 0.5  # s between two lines
+INTERVAL = 0.5  # s between two lines of progress
 
 
 def main(order: str) -> int:
@@ -20,29 +20,28 @@ def main(order: str) -> int:
     from flytune.task.task import load_task
     from flytune.training.loop import Progress, train
 
-    told = json.loads(order)
-    spoken = 0.0
+    options = json.loads(order)
+    written = -INTERVAL
 
-    def tell(progress: Progress) -> None:
-        nonlocal spoken
-        if progress.update == progress.updates or time.monotonic() - spoken > INTERVAL:
-            spoken = time.monotonic()
+    def write(progress: Progress) -> None:
+        nonlocal written
+        if progress.update == progress.updates or time.monotonic() - written > INTERVAL:
+            written = time.monotonic()
             print(json.dumps(dataclasses.asdict(progress)), flush=True)
 
     try:
-        out = Path(told["out"])
         train(
-            load_task(told["task"]),
-            told["trainer"],
-            seed=told["seed"],
-            out=out,
-            resume=told["resume"],
-            on_progress=tell,
+            load_task(options["task"]),
+            options["trainer"],
+            seed=options["seed"],
+            out=Path(options["out"]),
+            resume=options["resume"],
+            on_progress=write,
         )
     except FlytuneError as error:
         print(error, file=sys.stderr)
         return error.exit_code
-    except BrokenPipeError:  # whoever asked is gone; the run goes on from its checkpoint next time
+    except BrokenPipeError:  # the process that reads is gone; the training continues from its checkpoint next time
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
     return 0

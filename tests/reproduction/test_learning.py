@@ -4,7 +4,7 @@ import math
 
 import pytest
 
-from flytune.reproduction.curves import reward_at, smoothed_reward, steps_to_share, steps_to_survive
+from flytune.reproduction.learning import reward_at, smoothed_reward, steps_to_share, steps_to_survive
 from flytune.task.task import load_task
 
 
