@@ -7,7 +7,7 @@ import pytest
 
 from flytune.evaluation.flights import Flights
 from flytune.evaluation.judge import judge
-from flytune.reproduction.evidence import SETTINGS, WEIGHTS_FILES, Evaluation, Evidence
+from flytune.reproduction.evidence import SETTINGS, WEIGHTS_FILES, BehaviourResponse, Evidence
 from flytune.reproduction.study import BEHAVIOURS, Study
 
 TARGET = np.array([0.0, 0.0, 1.0])
@@ -62,12 +62,12 @@ def make_evidence(tmp_path):
 
     def make(constants, offsets=None, curves=None):
         study = Study(folder=tmp_path / "study", seeds=2)
-        evaluations = {}
+        responses = {}
         for behaviour in BEHAVIOURS:
             flights = first_order(constants[behaviour], (offsets or {}).get(behaviour, 0.0))
             judgement = judge(flights)
             ways = np.abs(flights.position[:, [0, -1], 0])
-            evaluation = Evaluation(
+            response = BehaviourResponse(
                 judgements=[judgement, judgement],
                 flights=flights,
                 rotor_speed=np.full((2, DISTANCES.size), 16_004.0),
@@ -76,11 +76,11 @@ def make_evidence(tmp_path):
             )
             for weights in WEIGHTS_FILES:
                 for setting in SETTINGS:
-                    evaluations[behaviour, weights, setting.name] = evaluation
+                    responses[behaviour, weights, setting.name] = response
         return Evidence(
             study=study,
             tasks={behaviour: study.task(behaviour) for behaviour in BEHAVIOURS},
-            evaluations=evaluations,
+            responses=responses,
             curves=curves or {behaviour: [curve(100.0), curve(101.0)] for behaviour in BEHAVIOURS},
         )
 
@@ -88,6 +88,6 @@ def make_evidence(tmp_path):
 
 
 @pytest.fixture
-def change_evaluation():
-    """A evaluation with other judgements."""
-    return lambda evaluation, judgements: dataclasses.replace(evaluation, judgements=judgements)
+def change_response():
+    """A response with other judgements."""
+    return lambda response, judgements: dataclasses.replace(response, judgements=judgements)

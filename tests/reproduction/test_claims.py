@@ -86,17 +86,17 @@ def test_a_reward_that_still_rises_has_not_saturated(make_evidence):
     assert verdict(make_evidence(ORDERED), "R28") == "holds under a reading"
 
 
-def test_noise_that_costs_trials_their_settling_is_seen(make_evidence, change_evaluation):
+def test_noise_that_costs_trials_their_settling_is_seen(make_evidence, change_response):
     evidence = make_evidence(ORDERED)
-    evaluations = dict(evidence.evaluations)
+    responses = dict(evidence.responses)
     for behaviour in BEHAVIOURS:
-        evaluation = evidence.evaluation(behaviour, "last", "fair")
-        judged = evaluation.judgements[0]
+        response = evidence.response(behaviour, "last", "fair")
+        judged = response.judgements[0]
         lost = judged.settling_time["position"].copy()
         lost[:4] = np.inf  # 4 of 20 trials
         noisy = dataclasses.replace(judged, settling_time={**judged.settling_time, "position": lost})
-        evaluations[behaviour, "last", "fair"] = change_evaluation(evaluation, [noisy, noisy])
-    (claim,) = judge_claims(dataclasses.replace(evidence, evaluations=evaluations), ["R30"])
+        responses[behaviour, "last", "fair"] = change_response(response, [noisy, noisy])
+    (claim,) = judge_claims(dataclasses.replace(evidence, responses=responses), ["R30"])
     assert claim.verdict == "does not hold"
     assert claim.measures[0].value == pytest.approx(0.8)
 
@@ -104,8 +104,8 @@ def test_noise_that_costs_trials_their_settling_is_seen(make_evidence, change_ev
 def with_slow_acrobatic(make_evidence, weights):
     """Ordered evidence, but acrobatic settles last with the given weights: 9.2 s, beyond every other behaviour."""
     evidence, slow = make_evidence(ORDERED), make_evidence({**ORDERED, "acrobatic": 2.0})
-    changed = {key: value for key, value in slow.evaluations.items() if key[:2] == ("acrobatic", weights)}
-    return dataclasses.replace(evidence, evaluations={**evidence.evaluations, **changed})
+    changed = {key: value for key, value in slow.responses.items() if key[:2] == ("acrobatic", weights)}
+    return dataclasses.replace(evidence, responses={**evidence.responses, **changed})
 
 
 @pytest.mark.parametrize(

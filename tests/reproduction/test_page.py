@@ -81,7 +81,7 @@ def test_each_verdict_has_its_word_and_its_colour(make_evidence):
     claims = judge_claims(evidence)
     read = Reader(html(evidence, claims, [], draw_figures(evidence)))
     shown = [attributes["class"] for tag, attributes in read.elements if tag == "span"]
-    assert set(shown) == {"holds", "reading", "fails", "untestable"}
+    assert set(shown) == {"verdict good", "verdict fair", "verdict bad", "verdict unknown"}
     assert len(shown) == 2 * len(claims)  # in the table of verdicts, and above the numbers
 
 
@@ -120,6 +120,6 @@ def test_verdicts_are_plain_values():
 
 def test_verdicts_are_written_as_tables_of_markdown(make_evidence):
     text = markdown([CLAIM], find_inconsistencies(make_evidence(ORDERED)))
-    assert "| R24 | a < b & <script>alert(1)</script> | does not hold | none |" in text
+    assert "| R24 | **does not hold** | a < b & <script>alert(1)</script> | none |" in text
     assert "| share <b> | 50.0 % [40.0 %, 60.0 %] | no |" in text
     assert all(f"\n### C{number}\n" in text for number in range(1, 11))

@@ -58,6 +58,7 @@ def _environment() -> jinja2.Environment:
     )
     environment.globals.update(asset=_asset, plotly=_plotly)
     environment.filters["data"] = _data
+    environment.filters["base64"] = lambda text: base64.b64encode(text.encode()).decode()
     environment.tests["in_space"] = lambda plot: any(trace.type == "scatter3d" for trace in plot.data)
     return environment
 

@@ -49,7 +49,7 @@ SETTINGS = (
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Evaluation:
+class BehaviourResponse:
     """The flights of one behaviour under one setting, judged seed by seed."""
 
     judgements: list[Judgement]
@@ -65,12 +65,12 @@ class Evidence:
 
     study: Study
     tasks: dict[str, Task]  # by behaviour
-    evaluations: dict[tuple[str, Weights, str], Evaluation]  # by behaviour, weights, name of the setting
+    responses: dict[tuple[str, Weights, str], BehaviourResponse]  # by behaviour, weights, name of the setting
     curves: dict[str, list[list[dict[str, Any]]]]  # behaviour -> seed -> rows of metrics.jsonl
 
-    def evaluation(self, behaviour: str, weights: Weights, setting: str = "fair") -> Evaluation:
+    def response(self, behaviour: str, weights: Weights, setting: str = "fair") -> BehaviourResponse:
         """The flights of one behaviour."""
-        return self.evaluations[behaviour, weights, setting]
+        return self.responses[behaviour, weights, setting]
 
 
 def gather_evidence(study: Study, on_message: Callable[[str], None] = lambda line: None) -> Evidence:
@@ -83,19 +83,19 @@ def gather_evidence(study: Study, on_message: Callable[[str], None] = lambda lin
         Diverged: a policy returned an action that is not finite.
     """
     tasks = {behaviour: study.task(behaviour) for behaviour in BEHAVIOURS}
-    evaluations, curves = {}, {}
+    responses, curves = {}, {}
     for behaviour in BEHAVIOURS:
         directories = [training.directory for training in study.trainings() if training.behaviour == behaviour]
         curves[behaviour] = [_read_rows(directory) for directory in directories]
         for weights, file in WEIGHTS_FILES.items():
             paths = [directory / file for directory in directories]
             for setting in SETTINGS:
-                evaluations[behaviour, weights, setting.name] = _fly(paths, tasks[behaviour], setting)
+                responses[behaviour, weights, setting.name] = _fly(paths, tasks[behaviour], setting)
         on_message(f"{study.preset(behaviour)}: evaluated, {TRIALS} trials of each seed under {len(SETTINGS)} settings")
-    return Evidence(study=study, tasks=tasks, evaluations=evaluations, curves=curves)
+    return Evidence(study=study, tasks=tasks, responses=responses, curves=curves)
 
 
-def _fly(paths: Sequence[Path], task: Task, setting: EvaluationSetting) -> Evaluation:
+def _fly(paths: Sequence[Path], task: Task, setting: EvaluationSetting) -> BehaviourResponse:
     if not setting.noise:
         none = {field.name: 0.0 for field in dataclasses.fields(task.noise)}
         task = dataclasses.replace(task, noise=dataclasses.replace(task.noise, **none))
@@ -117,7 +117,7 @@ def _fly(paths: Sequence[Path], task: Task, setting: EvaluationSetting) -> Evalu
         distance.append(left[:, 0])
         progress.append(1 - left[:, -1] / np.maximum(left[:, 0], 1e-9))
     assert first is not None, "a study has at least one seed"
-    return Evaluation(
+    return BehaviourResponse(
         judgements=judgements,
         flights=first,
         rotor_speed=np.array(speeds),

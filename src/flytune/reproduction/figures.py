@@ -94,7 +94,7 @@ def _boxes(
     figure, panels = _canvas(2, 2, 4.0)
     for axes, axis in zip(panels, AXES, strict=True):
         for place, behaviour in enumerate(BEHAVIOURS):
-            judged = evidence.evaluation(behaviour, weights, setting).judgements
+            judged = evidence.response(behaviour, weights, setting).judgements
             values = np.concatenate([metric(judgement, axis) for judgement in judged])
             share = f"{_box(axes, values, place, COLOURS[behaviour]):.0%}"
             axes.annotate(share, (place, 1.0), xycoords=("data", "axes fraction"), ha="center", va="bottom", fontsize=6)
@@ -132,7 +132,7 @@ def _profile(evidence: Evidence) -> Figure:
     for axes, axis in zip(panels, AXES, strict=True):
         target = band = 0.0
         for behaviour in BEHAVIOURS:
-            flights = evidence.evaluation(behaviour, "last", "printed").flights
+            flights = evidence.response(behaviour, "last", "printed").flights
             values, target, band = course(flights, axis)
             lines = axes.plot(flights.time, values[:SHOWN].T, color=COLOURS[behaviour], linewidth=0.8)
             lines[0].set_label(behaviour)
@@ -149,7 +149,7 @@ def _rotor_speed(evidence: Evidence) -> Figure:
     """Rotor speed, mean over four motors and five tests, against time: what the paper draws (C6)."""
     figure, (axes,) = _canvas(1, 1, 2.6)
     for behaviour in BEHAVIOURS:
-        flights = evidence.evaluation(behaviour, "last", "printed").flights
+        flights = evidence.response(behaviour, "last", "printed").flights
         speed = flights.rotor_speed_rpm[:SHOWN, 1:].mean(axis=(0, 2))
         axes.plot(flights.time[1:], speed, color=COLOURS[behaviour], linewidth=0.8, label=behaviour)
     axes.set_xlabel("time [s]")
@@ -164,7 +164,7 @@ def _actuation(evidence: Evidence) -> Figure:
     measured = (("RMS of the action [1]", "action_rms"), ("total variation [1 per step]", "action_total_variation"))
     for axes, (label, name) in zip(panels, measured, strict=True):
         for place, behaviour in enumerate(BEHAVIOURS):
-            judged = evidence.evaluation(behaviour, "last", "printed").judgements
+            judged = evidence.response(behaviour, "last", "printed").judgements
             _box(axes, np.concatenate([getattr(judgement, name) for judgement in judged]), place, COLOURS[behaviour])
         axes.set_ylabel(label)
         axes.set_ylim(bottom=0)

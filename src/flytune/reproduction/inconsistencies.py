@@ -56,8 +56,8 @@ def _standing_still(evidence: Evidence) -> Inconsistency:
     limit = standstill_distance(task, float(task.ppo.discount))
     if limit is not None and hasattr(find_trainer(evidence.study.trainer).settings(task), "discount"):
         for weights in ("last", "averaged"):
-            evaluation = evidence.evaluation("inspection", weights)
-            stood = [p[d > limit] < MOVED for p, d in zip(evaluation.progress, evaluation.distance, strict=True)]
+            response = evidence.response("inspection", weights)
+            stood = [p[d > limit] < MOVED for p, d in zip(response.progress, response.distance, strict=True)]
             what = f"inspection, {weights} weights: trials from beyond {limit:.2f} m that cover less than a tenth of the way"
             measures.append(share_of_trials(what, stood, None))
     text = (
@@ -71,7 +71,7 @@ def _standing_still(evidence: Evidence) -> Inconsistency:
 def _too_far(evidence: Evidence) -> Inconsistency:
     measures = []
     for behaviour in BEHAVIOURS:
-        flights = evidence.evaluation(behaviour, "last", "printed").flights
+        flights = evidence.response(behaviour, "last", "printed").flights
         distance = np.linalg.norm(flights.position[:, 0] - flights.target_position, axis=-1)
         bound = settling_time_bound(distance, flights.speed_bound)
         for duration in (10.0, float(evidence.tasks[behaviour].duration)):
@@ -87,7 +87,7 @@ def _too_far(evidence: Evidence) -> Inconsistency:
 
 
 def _already_ended(evidence: Evidence) -> Inconsistency:
-    flights = evidence.evaluation("baseline", "last", "printed").flights
+    flights = evidence.response("baseline", "last", "printed").flights
     low = flights.position[:, 0, 2] < 0.1
     return Inconsistency(
         item="C3",
@@ -98,7 +98,7 @@ def _already_ended(evidence: Evidence) -> Inconsistency:
 
 
 def _too_tilted(evidence: Evidence) -> Inconsistency:
-    flights = evidence.evaluation("inspection", "last", "fair").flights
+    flights = evidence.response("inspection", "last", "fair").flights
     tilt = np.degrees(
         np.arccos(np.clip(1 - 2 * (flights.attitude[:, 0, 0] ** 2 + flights.attitude[:, 0, 1] ** 2), -1, 1))
     )
@@ -117,7 +117,7 @@ def _too_tilted(evidence: Evidence) -> Inconsistency:
 def _bands(evidence: Evidence) -> Inconsistency:
     measures = []
     for behaviour in BEHAVIOURS:
-        judged = evidence.evaluation(behaviour, "last").judgements
+        judged = evidence.response(behaviour, "last").judgements
         primary = [np.isfinite(j.settling_time["position"]) for j in judged]
         measures.append(share_of_trials(f"{behaviour}: position settles within {POSITION_BAND:g} m", primary, None))
         for band in ("2%", "5%"):
@@ -131,7 +131,7 @@ def _mean_rotor_speed(evidence: Evidence) -> Inconsistency:
     hover = float(evidence.tasks["baseline"].vehicle.hover_rotor_speed_rpm)
     measures = [Measure(what="hover speed", value=hover, unit="rpm")]
     for behaviour in BEHAVIOURS:
-        speeds = evidence.evaluation(behaviour, "last", "printed").rotor_speed
+        speeds = evidence.response(behaviour, "last", "printed").rotor_speed
         measures.append(
             Measure(
                 what=f"{behaviour}: mean rotor speed of a trial less the hover speed, mean [least, most] of all trials",

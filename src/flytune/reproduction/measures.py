@@ -35,7 +35,7 @@ class ClaimMeasures:
 def _values(
     evidence: Evidence, behaviour: str, weights: Weights, of: PerTrial, setting: str = "fair"
 ) -> list[np.ndarray]:
-    return [of(judgement) for judgement in evidence.evaluation(behaviour, weights, setting).judgements]
+    return [of(judgement) for judgement in evidence.response(behaviour, weights, setting).judgements]
 
 
 def _shares(evidence: Evidence, weights: Weights, what: str, of: PerTrial, setting: str = "fair") -> list[Measure]:
@@ -50,7 +50,7 @@ def _pairs(
     evidence: Evidence, first: str, second: str, weights: Weights, setting: str = "fair"
 ) -> list[tuple[Judgement, Judgement]]:
     """The judgements of two behaviours, seed by seed."""
-    judged = (evidence.evaluation(behaviour, weights, setting).judgements for behaviour in (first, second))
+    judged = (evidence.response(behaviour, weights, setting).judgements for behaviour in (first, second))
     return list(zip(*judged, strict=True))
 
 
@@ -139,7 +139,7 @@ def overshoot(evidence: Evidence, weights: Weights) -> ClaimMeasures:
     def rows(kind: str, of: Callable[[Judgement], Mapping[str, np.ndarray]], setting: str) -> list[Measure]:
         found = []
         for behaviour in BEHAVIOURS:
-            tables = [of(judged) for judged in evidence.evaluation(behaviour, weights, setting).judgements]
+            tables = [of(judged) for judged in evidence.response(behaviour, weights, setting).judgements]
             pooled = {axis: np.concatenate([table[axis] for table in tables]) for axis in AXES}
             low, high = ({axis: quartile(pooled[axis], level) for axis in AXES} for level in (0.25, 0.75))
             for axis in "xyz":
@@ -179,7 +179,7 @@ def actuation(evidence: Evidence, weights: Weights) -> ClaimMeasures:
             measures.append(share_of_trials(f"inspection's {kind} of the action is below {other}'s", below))
     context = []
     for behaviour in BEHAVIOURS:
-        speeds = list(evidence.evaluation(behaviour, weights, "printed").rotor_speed)
+        speeds = list(evidence.response(behaviour, weights, "printed").rotor_speed)
         context.append(median_of_trials(f"{behaviour}: mean rotor speed", speeds, "rpm"))
     return ClaimMeasures(reading=measures, context=context)
 
@@ -197,7 +197,7 @@ def robustness(evidence: Evidence, weights: Weights) -> ClaimMeasures:
     """R30: how many trials lose their settling to the noise, and how many crash from the printed starts."""
     measures = []
     for behaviour in BEHAVIOURS:
-        noisy, quiet = (evidence.evaluation(behaviour, weights, name).judgements for name in ("fair", "noiseless"))
+        noisy, quiet = (evidence.response(behaviour, weights, name).judgements for name in ("fair", "noiseless"))
         kept = [
             np.isfinite(seen.settling_time["position"]) | ~np.isfinite(still.settling_time["position"])
             for seen, still in zip(noisy, quiet, strict=True)

@@ -46,9 +46,7 @@ class Reproduction:
 
     def table(self) -> str:
         """The verdicts and their summary, for a terminal."""
-        _, rows = verdict_table(self.claims)
-        lines = [f"{item:<14} {verdict:<26} {claim}" for item, claim, verdict, _ in rows]
-        return "\n".join([*lines, "", summary(self.claims)])
+        return f"{verdict_table(self.claims, ('verdict', 'claim'))}\n\n{summary(self.claims)}"
 
     def __repr__(self) -> str:
         return f"Reproduction({self.study.folder}: {summary(self.claims)})"
