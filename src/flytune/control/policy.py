@@ -73,6 +73,13 @@ class Policy:
         raw = self.actor(observation * self.input_scale)
         return jnp.tanh(raw) if self.squash == "tanh" else jnp.clip(raw, -1.0, 1.0)
 
+    def __repr__(self) -> str:
+        sizes = "-".join(map(str, [*(len(weight) for weight in self.actor.weights), len(self.actor.biases[-1])]))
+        made_for = (
+            f", {self.about['task']} on {self.about['vehicle']}" if {"task", "vehicle"} <= set(self.about) else ""
+        )
+        return f"Policy({sizes}, {self.squash}{made_for})"
+
     def initial_memory(self) -> tuple[()]:
         """Nothing: the policy is a function of the observation alone."""
         return ()

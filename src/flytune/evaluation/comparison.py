@@ -24,6 +24,9 @@ class Comparison:
     reference: int  # which of them the others are compared with
     differences: tuple[Difference, ...]  # per controller but the reference, and per metric
 
+    def __repr__(self) -> str:
+        return f"Comparison({', '.join(self.names)}; with {self.names[self.reference]})"
+
     @property
     def names(self) -> tuple[str, ...]:
         """The controllers' names, no two alike."""

@@ -50,6 +50,12 @@ class Flights:
     seed: int
     initial_conditions: str  # "clear" or "paper"
 
+    def __repr__(self) -> str:
+        crashed = f", {np.count_nonzero(self.crashed)} crashed" if self.crashed.any() else ""
+        return (
+            f"Flights({self.name or 'controller'} on {self.task}, {self.trials} trials of {self.duration:g} s{crashed})"
+        )
+
     @property
     def trials(self) -> int:
         """Number of trials N."""

@@ -58,6 +58,11 @@ class Judgement:
     crashed: PerTrialFlag
     violated: Mapping[str, PerTrialFlag]  # termination -> crossed at some sample
 
+    def __repr__(self) -> str:
+        settled, took = self.settled("position"), median(self.settling_time["position"])
+        time = f", median {took:.2f} s" if took is not None else ""
+        return f"Judgement({self.name or 'controller'} on {self.task}, {settled}/{self.trials} settled{time})"
+
     @property
     def trials(self) -> int:
         """Number of trials N."""

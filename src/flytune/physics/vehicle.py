@@ -44,6 +44,9 @@ class Vehicle:
     action_latency_steps: Annotated[Whole, Ge(0), Le(20), Unit("control steps")] = static()
     sources: dict[str, str] = label(default_factory=dict)
 
+    def __repr__(self) -> str:
+        return f"Vehicle({self.name}, {self.mass} kg)"
+
     @property
     def hover_rotor_speed_rpm(self) -> float:
         """The rotor speed at which four propellers carry the weight, sqrt(g m / 4 kf), in rpm (paper R5)."""

@@ -40,6 +40,10 @@ class Task:
     apg: ApgSettings = label(default_factory=ApgSettings)
     sources: dict[str, str] = label(default_factory=dict)
 
+    def __repr__(self) -> str:
+        terms, ends = " ".join(self.reward), " ".join(self.termination)
+        return f"Task({self.name} on {self.vehicle.name}, reward: {terms}, termination: {ends})"
+
     @property
     def speed_bound(self) -> float | None:
         """The tightest speed termination in m/s, or None where there is none."""

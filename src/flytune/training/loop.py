@@ -37,7 +37,8 @@ class Run:
     directory: Path | None
 
     def __repr__(self) -> str:
-        return f"Run({self.task.name}, {self.trainer}, seed {self.seed}, {len(self.metrics)} updates, {self.directory})"
+        where = f", in {self.directory}" if self.directory is not None else ""
+        return f"Run({self.task.name}, {self.trainer}, seed {self.seed}, {len(self.metrics)} updates{where})"
 
 
 def train(
