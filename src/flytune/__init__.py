@@ -20,6 +20,8 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from flytune.benchmark.throughput import Throughput as Throughput
+    from flytune.benchmark.throughput import bench as bench
     from flytune.control.classical import classical_controller as classical_controller
     from flytune.control.policy import Policy as Policy
     from flytune.control.policy import load_policy as load_policy
@@ -61,6 +63,7 @@ if TYPE_CHECKING:
     __version__: str
 
 _MODULES = {
+    "flytune.benchmark.throughput": ("Throughput", "bench"),
     "flytune.control.classical": ("classical_controller",),
     "flytune.control.policy": ("Policy", "load_policy", "save_policy"),
     "flytune.errors": ("BadInput", "Diverged", "FlytuneError", "Interrupted", "Unmet"),

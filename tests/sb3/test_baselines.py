@@ -8,7 +8,7 @@ import contextlib
 import sys
 
 from flytune.adapters.vec_env import HoverVecEnv
-from flytune.bench import baselines
+from flytune.benchmark import baselines
 from flytune.task.task import load_task
 
 

@@ -12,7 +12,7 @@ What = Annotated[Literal["all", "train", "simulate"], Parameter(name="WHAT", hel
 
 def bench(what: What = "all", /, *, as_json: AsJson = False) -> None:
     """Measure the throughput on this machine, beside that of other packages that are installed."""
-    from flytune.bench.throughput import bench
+    from flytune.benchmark.throughput import bench
 
     result = bench(what)
     print(json.dumps(result.to_dict()) if as_json else result.table())

@@ -1,4 +1,4 @@
-"""Controllers by name: what the command line's WHO stands for."""
+"""Controllers by name: what the command line's CONTROLLER stands for."""
 
 import dataclasses
 import json

@@ -10,7 +10,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from flytune.bench.baselines import Row, compare_simulation, compare_training
+from flytune.benchmark.baselines import Row, compare_simulation, compare_training
 from flytune.simulation import environment
 from flytune.task.observation import NOISY
 from flytune.task.task import Task, load_task
