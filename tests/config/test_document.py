@@ -63,27 +63,6 @@ def test_what_is_no_assignment_is_refused_with_an_example(text):
         document.parse_assignment(text)
 
 
-def test_an_edit_replaces_one_value_and_leaves_the_original_alone():
-    data = {"a": {"b": 1, "c": [2, 3]}, "d": 4}
-    assert document.edit(data, "a.b", 9) == {"a": {"b": 9, "c": [2, 3]}, "d": 4}
-    assert document.edit(data, "x.y", 9) == {**data, "x": {"y": 9}}
-    assert data == {"a": {"b": 1, "c": [2, 3]}, "d": 4}
-
-
-def test_a_table_laid_over_one_of_another_kind_replaces_it():
-    below = {"height": {"kind": "plain", "weight": 1, "sharpness": 2}, "speed": {"kind": "plain", "weight": 3}}
-    above = {"height": {"kind": "dual", "wide": 4}, "speed": {"kind": "plain", "sharpness": 5}}
-    assert document.overlay(below, above) == {
-        "height": {"kind": "dual", "wide": 4},
-        "speed": {"kind": "plain", "weight": 3, "sharpness": 5},
-    }
-
-
-def test_an_edit_through_a_value_is_refused():
-    with pytest.raises(BadInput, match=r"^a\.b\.c: a\.b is a value, not a table\.$"):
-        document.edit({"a": {"b": 1}}, "a.b.c", 2)
-
-
 @pytest.mark.parametrize(
     ("annotation", "words"),
     [

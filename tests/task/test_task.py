@@ -8,6 +8,7 @@ import pytest
 
 from flytune.config import document
 from flytune.config.document import source_of
+from flytune.config.nested import leaves
 from flytune.errors import BadInput
 from flytune.physics.vehicle import load_vehicle, vehicle_names
 from flytune.task.reward import DualExponential, Exponential, Smoothness, Survival
@@ -293,13 +294,6 @@ def test_a_file_based_on_nothing_that_ships_is_refused(tmp_path):
 
 @pytest.mark.parametrize("role", ["baseline", "acrobatic", "inspection"])
 def test_a_refined_preset_gives_a_reason_for_everything_it_changes(role):
-    def leaves(table, path=""):
-        for name, value in table.items():
-            if isinstance(value, dict):
-                yield from leaves(value, f"{path}{name}.")
-            else:
-                yield f"{path}{name}", value
-
     refined, printed = (load_task(name) for name in (f"{role}-refined", role))
     before = dict(leaves(document.plain(printed)))
     changed = {

@@ -6,7 +6,7 @@ import math
 
 import pytest
 
-from flytune.config import document
+from flytune.config import document, nested
 from flytune.task.task import load_task
 from flytune.tuning.choose import choose
 from flytune.tuning.iteration import HALF_WAY, Iteration
@@ -259,7 +259,7 @@ def test_the_nearest_iteration_predicts_the_other_measures_of_an_edit():
 
 def test_an_edit_that_the_task_cannot_have_beside_its_other_fields_is_left_out():
     # narrow may not be wider than wide
-    tables = document.edit(TABLES, "reward.horizontal.wide", 15.0)
+    tables = nested.edit(TABLES, "reward.horizontal.wide", 15.0)
     lower = dataclasses.replace(
         RULES[0], field="reward.horizontal.narrow", direction="down", slope=0.8, range=(1.0, 100.0)
     )

@@ -7,7 +7,7 @@ from html import escape
 
 import numpy as np
 
-from flytune.config import document
+from flytune.config import document, nested
 from flytune.evaluation.judge import AXES, CHANNELS, Judgement
 from flytune.report.style import listed
 from flytune.task.task import Task, write_task
@@ -121,7 +121,9 @@ def comparison_table(judged: Sequence[tuple[str, str, Judgement]]) -> str:
 
 def differences_table(tasks: Sequence[tuple[str, Task]]) -> str:
     """The fields in which the tasks of several policies differ, one column per policy; a sentence where none does."""
-    flat = [dict(_leaves(document.plain(task))) for _, task in tasks]
+    flat = [
+        {path: str(value) for path, value in nested.leaves(document.plain(task), skip=["sources"])} for _, task in tasks
+    ]
     paths = dict.fromkeys(path for leaves in flat for path in leaves)
     differing = [path for path in paths if len({leaves.get(path) for leaves in flat}) > 1]
     if not differing:
@@ -131,17 +133,6 @@ def differences_table(tasks: Sequence[tuple[str, Task]]) -> str:
         (f"<code>{escape(path)}</code>", *(escape(leaves.get(path, DASH)) for leaves in flat)) for path in differing
     ]
     return table(head, rows)
-
-
-def _leaves(node: Mapping, path: str = "") -> list[tuple[str, str]]:
-    """Every value of nested tables as text, by its path; the sources of numbers are left out."""
-    found = []
-    for key, value in node.items():
-        if isinstance(value, Mapping):
-            found += [] if key == "sources" else _leaves(value, f"{path}{key}.")
-        else:
-            found.append((f"{path}{key}", str(value)))
-    return found
 
 
 def task_listing(task: Task) -> str:

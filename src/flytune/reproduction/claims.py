@@ -10,6 +10,7 @@ from importlib import resources
 from typing import Any
 
 from flytune.config import document
+from flytune.config.nested import leaves
 from flytune.reproduction import learning, measures
 from flytune.reproduction.evidence import Evidence, Weights
 from flytune.reproduction.measures import ClaimMeasures
@@ -58,13 +59,13 @@ def _claim(evidence: Evidence, item: str, text: dict[str, Any]) -> JudgedClaim:
 
 def _heuristic(evidence: Evidence, item: str, text: dict[str, Any]) -> JudgedClaim:
     """What three presets can say of one parameter: its values, and how many others changed with it."""
-    leaves = {behaviour: _leaves(document.plain(task)) for behaviour, task in evidence.tasks.items()}
+    values_of = {behaviour: dict(leaves(document.plain(task))) for behaviour, task in evidence.tasks.items()}
     rows = []
     for parameter in text["parameters"]:
-        values = ", ".join(f"{behaviour} {leaves[behaviour].get(parameter, 'none')}" for behaviour in BEHAVIOURS)
+        values = ", ".join(f"{behaviour} {values_of[behaviour].get(parameter, 'none')}" for behaviour in BEHAVIOURS)
         rows.append(Measure(what=f"{parameter}: {values}", value=None))
     for behaviour in ("acrobatic", "inspection"):
-        ours, baseline = leaves[behaviour], leaves["baseline"]
+        ours, baseline = values_of[behaviour], values_of["baseline"]
         changed = [
             path
             for path in ours.keys() | baseline.keys()
@@ -79,11 +80,3 @@ def _heuristic(evidence: Evidence, item: str, text: dict[str, Any]) -> JudgedCla
         why=f"Three presets that differ in many parameters at once cannot show what one of them does. {text['why']}",
         measures=rows,
     )
-
-
-def _leaves(table: dict[str, Any], path: str = "") -> dict[str, Any]:
-    """Every value of nested tables by its dotted path."""
-    found = {}
-    for name, value in table.items():
-        found |= _leaves(value, f"{path}{name}.") if isinstance(value, dict) else {f"{path}{name}": value}
-    return found

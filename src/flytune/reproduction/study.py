@@ -9,9 +9,10 @@ from typing import Any, Literal
 
 from flytune.config import document
 from flytune.config.files import make_folder, write_json
+from flytune.config.nested import first_difference
 from flytune.control.policy import load_policy
 from flytune.errors import BadInput
-from flytune.runs.directory import first_difference, has_checkpoint, read_facts
+from flytune.runs.directory import has_checkpoint, read_facts
 from flytune.task.task import Task, load_task
 from flytune.training.trainer import find_trainer
 

@@ -16,7 +16,7 @@ import numpy as np
 import safetensors
 import safetensors.numpy
 
-from flytune.config import document
+from flytune.config import document, nested
 from flytune.config.files import make_folder, write_bytes, write_json, write_text
 from flytune.control.policy import Policy, save_policy
 from flytune.errors import BadInput
@@ -75,7 +75,7 @@ class RunDirectory:
                 f"not {trainer}, seed {seed}. Give the same, or another directory."
             )
         before, now = document.plain(load_task(self.path / "task.toml")), document.plain(task)
-        if path := first_difference(before, now):
+        if path := nested.first_difference(before, now):
             raise BadInput(
                 f"resume: {self.path} was trained with another {path}. Give {self.path}/task.toml as the task."
             )
@@ -187,18 +187,6 @@ def _commit() -> str | None:
 
     # a package installed inside somebody else's repository is not part of it
     return git("rev-parse", "HEAD") if git("ls-files", "--error-unmatch", here.name) else None
-
-
-def first_difference(first: Any, second: Any, path: str = "") -> str | None:
-    """The path of the first value in which two nested tables differ, names and sources apart; None where none does."""
-    if isinstance(first, dict) and isinstance(second, dict):
-        for name in sorted(set(first) | set(second)):
-            if name in ("name", "sources"):
-                continue
-            if found := first_difference(first.get(name), second.get(name), f"{path}.{name}" if path else name):
-                return found
-        return None
-    return None if first == second else path
 
 
 def _is_key(leaf: Any) -> bool:

@@ -8,7 +8,7 @@ from typing import Annotated, Any
 
 from annotated_types import Ge, Gt, Le, Unit
 
-from flytune.config import document
+from flytune.config import document, nested
 from flytune.config.document import Real, Whole
 from flytune.config.pytree import label, pytree
 from flytune.errors import BadInput
@@ -110,7 +110,7 @@ def _on_its_base(data: dict[str, Any], where: str) -> dict[str, Any]:
     base = data["based_on"]
     if base not in preset_names():
         raise BadInput(f"{where}: based_on: {base!r} is no preset. Allowed: {', '.join(preset_names())}.")
-    return document.overlay(_preset(base), changes)
+    return nested.overlay(_preset(base), changes)
 
 
 def read_task_text(text: str, where: str) -> Task:
@@ -137,7 +137,7 @@ def _edited(data: dict[str, Any], path: str, value: Any) -> dict[str, Any]:
     """The task's tables after one edit, the source of what was edited now the user."""
     if path == "vehicle" and isinstance(value, str):
         return {**data, "vehicle": vehicle_table(value)}
-    data = document.edit(data, path, value)
+    data = nested.edit(data, path, value)
     owner, field = (data["vehicle"], path[len("vehicle.") :]) if path.startswith("vehicle.") else (data, path)
     if not path.startswith(("name", "sources", "vehicle.name", "vehicle.sources")):
         sources = owner.get("sources", {})

@@ -6,6 +6,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, Self
 
+from flytune.config.nested import leaves
 from flytune.extras import require
 
 
@@ -67,10 +68,8 @@ class EventLog:
         self._records.write(event.SerializeToString())
 
 
-def scalars(row: dict[str, Any], path: str = "") -> Iterator[tuple[str, float]]:
+def scalars(row: dict[str, Any]) -> Iterator[tuple[str, float]]:
     """Name and value of each finite number of a row, without the steps; `terms/attitude` for one in a table."""
-    for name, value in row.items():
-        if isinstance(value, dict):
-            yield from scalars(value, f"{path}{name}/")
-        elif isinstance(value, int | float) and math.isfinite(value) and path + name != "steps":
-            yield path + name, float(value)
+    for name, value in leaves(row, separator="/"):
+        if isinstance(value, int | float) and math.isfinite(value) and name != "steps":
+            yield name, float(value)

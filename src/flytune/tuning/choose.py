@@ -5,7 +5,7 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from flytune.config import document
+from flytune.config import document, nested
 from flytune.errors import BadInput
 from flytune.task.task import Task
 from flytune.training.trainer import DEFAULT_TRAINER
@@ -64,7 +64,7 @@ def _is_allowed(context: Context, iteration: Iteration, edit: Edit) -> bool:
     """Whether the task remains valid with the edit: one field may limit another, as `wide` limits `narrow`."""
     tables = dict(context.tables)
     for path, value in {**iteration.values, edit.field: edit.after}.items():
-        tables = document.edit(tables, path, round(value) if is_whole(tables, path) else value)
+        tables = nested.edit(tables, path, round(value) if is_whole(tables, path) else value)
     try:
         document.read(Task, tables)
     except BadInput:

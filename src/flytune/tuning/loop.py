@@ -9,9 +9,10 @@ from typing import Any
 
 from flytune.config import document
 from flytune.config.files import write_json, write_text
+from flytune.config.nested import first_difference
 from flytune.control.policy import Policy, load_policy
 from flytune.errors import Diverged
-from flytune.runs.directory import first_difference, has_checkpoint
+from flytune.runs.directory import has_checkpoint
 from flytune.task.task import Task, load_task, write_task
 from flytune.training.loop import Progress, train
 from flytune.training.trainer import find_trainer

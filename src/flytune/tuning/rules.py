@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal
 
 from annotated_types import Gt
 
-from flytune.config import document
+from flytune.config import document, nested
 from flytune.config.document import Real
 from flytune.config.pytree import pytree
 from flytune.errors import BadInput
@@ -117,10 +117,8 @@ def is_whole(task: Mapping[str, Any], path: str) -> bool:
 
 
 def _number_at(task: Mapping[str, Any], path: str) -> int | float | None:
-    node: Any = task
-    for part in path.split("."):
-        node = node.get(part) if isinstance(node, Mapping) else None
-    return node if isinstance(node, int | float) and not isinstance(node, bool) else None
+    value = nested.look_up(task, path)
+    return value if isinstance(value, int | float) and not isinstance(value, bool) else None
 
 
 def is_fixed(path: str, fixed: Sequence[str]) -> bool:

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from flytune.config import document
+from flytune.config import document, nested
 from flytune.control.classical import classical_controller
 from flytune.control.policy import Policy, load_policy
 from flytune.errors import BadInput
@@ -91,7 +91,7 @@ def edited(task: Task, changes: Mapping[str, tuple[Any, str]]) -> Task:
     """The task with some fields changed; the reason of each change becomes its source."""
     tables = document.plain(task)
     for path, (value, why) in changes.items():
-        tables = document.edit(tables, path, value)
+        tables = nested.edit(tables, path, value)
         tables["sources"] = {**tables.get("sources", {}), path: why}
     return document.read(Task, tables)
 

@@ -1,0 +1,121 @@
+"""What the annotation of a dataclass's field says of it, in words for people.
+
+An annotation holds type, unit and range (`Annotated[Real, Ge(0), Unit("m/s")]`). The reader, the writer and the error
+messages all take them from there, so no second list is needed.
+"""
+
+import dataclasses
+import difflib
+import types
+from collections.abc import Iterable, Mapping
+from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
+
+import annotated_types
+from pydantic import AllowInfNan, Strict
+
+Real = Annotated[float, Strict(), AllowInfNan(False)]
+Whole = Annotated[int, Strict()]
+Vector = tuple[Real, Real, Real]
+
+_LOWER = {annotated_types.Ge: "ge", annotated_types.Gt: "gt"}
+_UPPER = {annotated_types.Le: "le", annotated_types.Lt: "lt"}
+
+
+def allowed(annotation: Any) -> str:
+    """The values a field accepts, in words."""
+    base, details = unwrap(annotation)
+    if get_origin(base) is Literal:
+        return "one of " + ", ".join(map(str, get_args(base)))
+    if is_union(base):
+        options = [option for option in get_args(base) if option is not type(None)]
+        return " or ".join(dict.fromkeys(allowed(option) for option in options))
+    if dataclasses.is_dataclass(base) or get_origin(base) is dict:
+        return "a table"
+    if get_origin(base) is tuple:
+        items = [item for item in get_args(base) if item is not Ellipsis]
+        length = f"{len(items)} values" if len(items) == len(get_args(base)) else "a list"
+        return f"{length}, each {allowed(items[0])}"
+    lower = [(getattr(d, _LOWER[type(d)]), type(d)) for d in details if type(d) in _LOWER]
+    upper = [(getattr(d, _UPPER[type(d)]), type(d)) for d in details if type(d) in _UPPER]
+    number = "a whole number" if base is int else ""
+    if lower and upper:
+        above = "above " if lower[0][1] is annotated_types.Gt else ""
+        below = "below " if upper[0][1] is annotated_types.Lt else ""
+        text = f"{above}{lower[0][0]} to {below}{upper[0][0]}"
+    elif lower:
+        text = f"above {lower[0][0]}" if lower[0][1] is annotated_types.Gt else f"{lower[0][0]} or more"
+    elif upper:
+        text = f"below {upper[0][0]}" if upper[0][1] is annotated_types.Lt else f"{upper[0][0]} or less"
+    else:
+        text = {float: "a finite number", int: "", str: "text", bool: "true or false"}.get(base, str(base))
+    return ", ".join(part for part in (number, text) if part)
+
+
+def unit_of(kind: Any, data: Mapping[str, Any], path: str) -> str:
+    """The unit of the field at a dotted path of a dataclass's tables; empty where it has none, or there is no field."""
+    annotation, node = kind, data
+    for name in path.split("."):
+        annotation = step_into(annotation, name, node)
+        node = node.get(name, {}) if isinstance(node, Mapping) else {}
+    return "" if annotation is None else unit_text(annotation)
+
+
+def nearest(name: str, options: Iterable[str]) -> str | None:
+    """The option spelled most like `name`, or None where nothing is near."""
+    found = difflib.get_close_matches(name, list(options), n=1, cutoff=0.6)
+    return found[0] if found else None
+
+
+def unit_text(annotation: Any, before: str = "") -> str:
+    """The unit of an annotation with `before` in front of it; empty where it has none."""
+    base, details = unwrap(annotation)
+    if get_origin(base) is tuple:
+        return unit_text(get_args(base)[0], before)
+    for detail in details:
+        if isinstance(detail, annotated_types.Unit) and detail.unit != "1":
+            return before + detail.unit
+    return ""
+
+
+def unwrap(annotation: Any) -> tuple[Any, list[Any]]:
+    """A type without its Annotated layers, and everything those layers said."""
+    details: list[Any] = []
+    while get_origin(annotation) is Annotated:
+        annotation, *more = get_args(annotation)
+        details += more
+    return annotation, details
+
+
+def annotations(kind: Any) -> dict[str, Any]:
+    """The annotation of each field of a dataclass, with what stands inside `Annotated`."""
+    return get_type_hints(kind, include_extras=True)
+
+
+def step_into(annotation: Any, name: Any, data: Any) -> Any:
+    """The annotation one step further down a path, or None where the path leaves what is known."""
+    base, _ = unwrap(annotation)
+    if is_union(base):
+        base = variant_of(base, data)
+    if dataclasses.is_dataclass(base):
+        return annotations(base).get(name)
+    if get_origin(base) is dict:
+        return get_args(base)[1]
+    if get_origin(base) is tuple:
+        return get_args(base)[0]
+    return None
+
+
+def is_union(base: Any) -> bool:
+    """Whether a type is a union."""
+    return get_origin(base) in (Union, types.UnionType)
+
+
+def variant_of(union: Any, data: Any) -> Any:
+    """The member of a union of dataclasses that the data's `kind` names; else its first dataclass."""
+    members = [unwrap(option)[0] for option in get_args(union)]
+    classes = [option for option in members if dataclasses.is_dataclass(option)]
+    wanted = data.get("kind") if isinstance(data, Mapping) else None
+    for option in classes:
+        if wanted is not None and wanted in get_args(annotations(option).get("kind")):
+            return option
+    return classes[0] if classes else None
