@@ -44,6 +44,17 @@ def test_a_margin_is_the_share_of_the_bound_that_is_left(name, situation):
         assert condition.margin(situation(**at(share))) == pytest.approx(1 - share, abs=2e-6)
 
 
+@pytest.mark.parametrize(
+    ("name", "quantity", "limit"),
+    [("altitude", "altitude", 0.1), ("distance", "distance", 3.0), ("attitude", "attitude_error", 1.0),
+     ("roll", "tilt", math.pi / 12), ("speed", "speed", 0.8), ("body_rate", "body_rate", 530 / 180 * math.pi)],
+)  # fmt: skip
+def test_a_limit_is_the_bound_in_si_units_and_names_its_quantity(name, quantity, limit):
+    condition = CONDITIONS[name][0]
+    assert (condition.quantity, condition.limit) == (quantity, pytest.approx(limit))
+    assert getattr(condition, condition.key) is not None
+
+
 @pytest.mark.parametrize("name", CONDITIONS)
 def test_a_margin_is_negative_just_beyond_the_bound_and_positive_just_within(name, situation):
     condition, at = CONDITIONS[name]

@@ -1,6 +1,5 @@
 """Classical controllers by name, their gains read from gains/NAME.toml: two sets each, textbook and tuned."""
 
-import math
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -14,7 +13,6 @@ from flytune.control.pid import Pid, PidGains
 from flytune.control.steering import tighter
 from flytune.errors import BadInput
 from flytune.task.task import Task
-from flytune.task.termination import MaximumBodyRate, MaximumTilt
 
 SETS = ("tuned", "textbook")
 AnyGains = PidGains | GeometricGains | LqrGains
@@ -92,14 +90,16 @@ def controller_with(gains: AnyGains, task: Task) -> Controller:
     Raises:
         BadInput: the gains give no stabilising feedback.
     """
-    share, ends = float(gains.bound_share), task.termination.values()
-    tilts = [math.radians(float(end.bound_deg)) for end in ends if isinstance(end, MaximumTilt)]
-    rates = [math.radians(float(end.bound_deg_per_s)) for end in ends if isinstance(end, MaximumBodyRate)]
+
+    def used(quantity: str) -> float | None:
+        limit = task.limit(quantity)
+        return None if limit is None else float(gains.bound_share) * limit
+
     limits: dict[str, Any] = {
         "target_yaw": float(task.target.yaw),
-        "speed_limit": None if task.speed_bound is None else share * task.speed_bound,
-        "tilt_limit": tighter(float(gains.largest_tilt), share * min(tilts) if tilts else None),
-        "body_rate_limit": share * min(rates) if rates else None,
+        "speed_limit": used("speed"),
+        "tilt_limit": tighter(float(gains.largest_tilt), used("tilt")),
+        "body_rate_limit": used("body_rate"),
     }
     if isinstance(gains, LqrGains):
         return make_lqr(task.vehicle, gains, **limits)

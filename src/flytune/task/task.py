@@ -17,7 +17,7 @@ from flytune.task.initial_state import InitialState
 from flytune.task.observation import ObservationNoise
 from flytune.task.reward import RewardTerm
 from flytune.task.situation import Target
-from flytune.task.termination import MaximumSpeed, Termination
+from flytune.task.termination import Termination
 from flytune.task.training_settings import ApgSettings, PpoSettings
 
 
@@ -44,11 +44,18 @@ class Task:
         terms, ends = " ".join(self.reward), " ".join(self.termination)
         return f"Task({self.name} on {self.vehicle.name}, reward: {terms}, termination: {ends})"
 
+    def limit(self, quantity: str) -> float | None:
+        """The tightest bound of the terminations on a quantity, in SI units, or None where none bounds it.
+
+        `quantity` is altitude, distance, attitude_error, tilt, speed or body_rate.
+        """
+        limits = [float(end.limit) for end in self.termination.values() if end.quantity == quantity]
+        return (max if quantity == "altitude" else min)(limits, default=None)
+
     @property
     def speed_bound(self) -> float | None:
-        """The tightest speed termination in m/s, or None where there is none."""
-        bounds = [float(end.bound) for end in self.termination.values() if isinstance(end, MaximumSpeed)]
-        return min(bounds, default=None)
+        """The tightest bound on speed in m/s, or None where there is none."""
+        return self.limit("speed")
 
     def problem(self) -> str | None:
         """What makes the numbers impossible together, or None."""

@@ -3,11 +3,16 @@
 A condition returns a margin, the share of its bound that is left: positive inside, zero at the bound, negative beyond.
 Training, barriers, evaluation and plots all read the same margins.
 
-To add a condition: write a class with a `kind`, a bound and `margin(situation)`, and name it in `Termination`.
+To add a condition: write a class with a `kind`, a bound, `margin(situation)`, and what every condition has beside them,
+and name the class in `Termination`:
+
+    quantity   what is bounded: altitude, distance, attitude_error, tilt, speed or body_rate
+    key        the field that holds the bound, for error messages and edits
+    limit      the bound in SI units (m, m/s, rad, rad/s)
 """
 
 import math
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import jax.numpy as jnp
 from annotated_types import Gt, Le, Unit
@@ -26,24 +31,36 @@ SAFE = -1  # cause of an episode that goes on
 class MinimumAltitude:
     """Ends an episode that sinks below `bound`. Source: paper R14, 0.1 m."""
 
+    quantity, key = "altitude", "bound"
     kind: Literal["minimum_altitude"] = static(default="minimum_altitude")
     bound: Annotated[Real, Gt(0), Unit("m")]
 
+    @property
+    def limit(self) -> Any:
+        """The bound in m."""
+        return self.bound
+
     def margin(self, situation: Situation) -> Float[Array, ""]:
         """(z - bound) / bound: zero at the bound, one at twice its height."""
-        return situation.altitude / self.bound - 1
+        return situation.altitude / self.limit - 1
 
 
 @pytree
 class MaximumDistance:
     """Ends an episode that strays from its target (H11). Source: paper R14, 3.0 m."""
 
+    quantity, key = "distance", "bound"
     kind: Literal["maximum_distance"] = static(default="maximum_distance")
     bound: Annotated[Real, Gt(0), Unit("m")]
 
+    @property
+    def limit(self) -> Any:
+        """The bound in m."""
+        return self.bound
+
     def margin(self, situation: Situation) -> Float[Array, ""]:
         """Share of the bound that is left: 1 at the target."""
-        return 1 - rotation.safe_norm(situation.position_error) / self.bound
+        return 1 - rotation.safe_norm(situation.position_error) / self.limit
 
 
 @pytree
@@ -53,24 +70,36 @@ class MaximumAttitudeError:
     Source: paper R14, pi: never true of an angle in [0, pi], and kept because it is printed (C9).
     """
 
+    quantity, key = "attitude_error", "bound"
     kind: Literal["maximum_attitude_error"] = static(default="maximum_attitude_error")
     bound: Annotated[Real, Gt(0), Le(math.pi), Unit("rad")]
 
+    @property
+    def limit(self) -> Any:
+        """The bound in rad."""
+        return self.bound
+
     def margin(self, situation: Situation) -> Float[Array, ""]:
         """Share of the bound that is left: 1 at the target's attitude."""
-        return 1 - rotation.angle(situation.attitude_error) / self.bound
+        return 1 - rotation.angle(situation.attitude_error) / self.limit
 
 
 @pytree
 class MaximumTilt:
     """Ends an episode that rolls or pitches too far, in place of the geodesic bound (H10). Source: paper R14."""
 
+    quantity, key = "tilt", "bound_deg"
     kind: Literal["maximum_tilt"] = static(default="maximum_tilt")
     bound_deg: Annotated[Real, Gt(0), Le(180), Unit("deg")]
 
+    @property
+    def limit(self) -> Any:
+        """The bound in rad."""
+        return self.bound_deg * math.pi / 180
+
     def margin(self, situation: Situation) -> Float[Array, ""]:
         """Share of the bound that the larger of |roll| and |pitch| leaves."""
-        return 1 - jnp.maximum(jnp.abs(situation.roll), jnp.abs(situation.pitch)) / (self.bound_deg * math.pi / 180)
+        return 1 - jnp.maximum(jnp.abs(situation.roll), jnp.abs(situation.pitch)) / self.limit
 
 
 @pytree
@@ -80,12 +109,18 @@ class MaximumSpeed:
     Source: paper R14: 0.8 m/s baseline, 1.0 acrobatic, 0.2 inspection.
     """
 
+    quantity, key = "speed", "bound"
     kind: Literal["maximum_speed"] = static(default="maximum_speed")
     bound: Annotated[Real, Gt(0), Unit("m/s")]
 
+    @property
+    def limit(self) -> Any:
+        """The bound in m/s."""
+        return self.bound
+
     def margin(self, situation: Situation) -> Float[Array, ""]:
         """Share of the bound that is left: 1 at rest."""
-        return 1 - rotation.safe_norm(situation.velocity) / self.bound
+        return 1 - rotation.safe_norm(situation.velocity) / self.limit
 
 
 @pytree
@@ -95,12 +130,18 @@ class MaximumBodyRate:
     Source: paper R14: 530 deg/s baseline and acrobatic, 115 inspection.
     """
 
+    quantity, key = "body_rate", "bound_deg_per_s"
     kind: Literal["maximum_body_rate"] = static(default="maximum_body_rate")
     bound_deg_per_s: Annotated[Real, Gt(0), Unit("deg/s")]
 
+    @property
+    def limit(self) -> Any:
+        """The bound in rad/s."""
+        return self.bound_deg_per_s * math.pi / 180
+
     def margin(self, situation: Situation) -> Float[Array, ""]:
         """Share of the bound that is left: 1 where nothing turns."""
-        return 1 - rotation.safe_norm(situation.body_rate) / (self.bound_deg_per_s * math.pi / 180)
+        return 1 - rotation.safe_norm(situation.body_rate) / self.limit
 
 
 Termination = Annotated[

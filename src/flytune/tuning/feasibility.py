@@ -11,7 +11,6 @@ from flytune.evaluation.lower_bounds import settling_time_bound, thrust_bound
 from flytune.evaluation.metrics import YAW_BAND, wrap_angle, yaw_angle
 from flytune.evaluation.statistics import quantile
 from flytune.task.task import Task
-from flytune.task.termination import MaximumBodyRate, MaximumSpeed
 from flytune.tuning.requirement import Requirement
 from flytune.tuning.rules import is_fixed
 
@@ -32,17 +31,17 @@ def check_feasible(task: Task, requirement: Requirement, flights: Flights, fixed
     if axis == "yaw":
         angle = np.abs(wrap_angle(yaw_angle(flights.attitude[:, 0]) - flights.target_yaw))
         for name, end in task.termination.items():
-            if isinstance(end, MaximumBodyRate) and is_fixed(f"termination.{name}.bound_deg_per_s", fixed):
-                rate = math.radians(float(end.bound_deg_per_s))
-                cause = f"the body rate bound of {float(end.bound_deg_per_s):g} deg/s you have set"
+            if end.quantity == "body_rate" and is_fixed(f"termination.{name}.{end.key}", fixed):
+                rate = float(end.limit)
+                cause = f"the body rate bound of {math.degrees(float(end.limit)):g} deg/s you have set"
                 _compare(requirement, settling_time_bound(angle, rate, YAW_BAND), cause)
         return
     way = np.asarray(flights.target_position - flights.position[:, 0], dtype=np.float64)
     distance = np.linalg.norm(way, axis=1) if axis == "position" else np.abs(way[:, "xyz".index(axis)])
     for name, end in task.termination.items():
-        if isinstance(end, MaximumSpeed) and is_fixed(f"termination.{name}.bound", fixed):
-            cause = f"the speed bound of {float(end.bound):g} m/s you have set"
-            _compare(requirement, settling_time_bound(distance, float(end.bound)), cause, distance)
+        if end.quantity == "speed" and is_fixed(f"termination.{name}.{end.key}", fixed):
+            cause = f"the speed bound of {float(end.limit):g} m/s you have set"
+            _compare(requirement, settling_time_bound(distance, float(end.limit)), cause, distance)
     gravity = float(task.vehicle.gravity)
     thrust = float(task.vehicle.thrust_to_weight) * gravity
     if axis == "position":
