@@ -170,7 +170,7 @@ def test_a_resumed_run_of_another_trainer_is_refused(task, tmp_path):
 @pytest.mark.parametrize(
     ("edit", "said"),
     [
-        ({"clip_apart": True}, r"ppo\.clip_apart: true is not allowed.*Allowed: false\."),
+        ({"separate_grad_clipping": True}, r"ppo\.separate_grad_clipping: true is not allowed.*Allowed: false\."),
         ({"final_learning_rate": 0.5}, r"ppo\.final_learning_rate: 0\.5 is not allowed.*Allowed: 1\.0\."),
         ({"input_scale": (2.0, 1.0, 1.0, 1.0, 1.0)}, r"ppo\.input_scale: \[2\.0, 1\.0.*Allowed: \[1\.0, 1\.0"),
     ],

@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+import re
 
 import jax
 import pytest
@@ -12,7 +13,7 @@ from flytune.config.nested import leaves
 from flytune.errors import BadInput
 from flytune.physics.vehicle import load_vehicle, vehicle_names
 from flytune.task.reward import DualExponential, Exponential, Smoothness, Survival
-from flytune.task.task import load_task, preset_names, read_task_text, write_task
+from flytune.task.task import RENAMED, load_task, preset_names, read_task_text, write_task
 
 PAPER_REWARDS = {
     "baseline": {  # R11
@@ -86,7 +87,7 @@ def test_a_trial_lasts_ten_seconds_and_twenty_for_the_slow_inspection(tasks):
 @pytest.mark.parametrize("preset", PAPER_REWARDS)
 def test_a_preset_is_learned_with_the_papers_settings(tasks, preset):
     ppo = tasks[preset].ppo
-    assert (ppo.minibatch, ppo.learning_rate, ppo.epochs, ppo.clip) == (128, 2e-4, 12, 0.15)  # R17
+    assert (ppo.minibatch, ppo.learning_rate, ppo.epochs, ppo.clip_range) == (128, 2e-4, 12, 0.15)  # R17
     assert (ppo.steps, ppo.hidden) == (6_000_000, (64, 64))  # R18, R16
     assert ppo.environments * ppo.rollout == 4 * 4096  # the samples of R18
     # Stable-Baselines3's defaults
@@ -303,3 +304,17 @@ def test_a_refined_preset_gives_a_reason_for_everything_it_changes(role):
     }
     assert changed
     assert {path for path in changed if not source_of(path, refined.sources).startswith("refined: ")} == set()
+
+
+@pytest.mark.parametrize("old", RENAMED)
+def test_a_key_that_was_renamed_is_refused_with_its_new_name_in_files_and_in_edits(old, tmp_path):
+    new = RENAMED[old]
+    message = re.escape(f"{old}: is called {new} now. Write {new} instead.")
+    with pytest.raises(BadInput, match=f"^{message}$"):
+        load_task("baseline", {old: 0.5})
+    table, key = old.split(".")
+    (tmp_path / "old.toml").write_text(f'based_on = "baseline"\n[{table}]\n{key} = 0.5\n')
+    with pytest.raises(BadInput, match=f"^.*old.toml: {message}$"):
+        load_task(tmp_path / "old.toml")
+    kept = load_task("baseline", {new: False if "clipping" in new else 0.5})
+    assert getattr(getattr(kept, table), new.split(".")[1]) in (0.5, False)

@@ -115,7 +115,7 @@ def test_clipping_takes_the_gradient_from_samples_that_have_moved_far_enough(sma
 
 @pytest.mark.parametrize("apart", [False, True])
 def test_gradients_are_clipped_as_a_whole_or_apart(small_task, apart):
-    settings = dataclasses.replace(small_task.ppo, clip_apart=apart, max_grad_norm=0.5)
+    settings = dataclasses.replace(small_task.ppo, separate_grad_clipping=apart, max_grad_norm=0.5)
     parameters = ppo.start(small_task, settings, jax.random.key(0)).parameters
     actor = jax.tree.map(lambda leaf: 0.1 * jnp.ones_like(leaf), parameters)
     gradient = dataclasses.replace(actor, critic=jax.tree.map(lambda leaf: 10 * jnp.ones_like(leaf), parameters.critic))

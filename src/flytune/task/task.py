@@ -20,6 +20,19 @@ from flytune.task.situation import Target
 from flytune.task.termination import Termination
 from flytune.task.training_settings import ApgSettings, PpoSettings
 
+# keys of task files that had another name in version 0.1
+RENAMED = {
+    "apg.average": "apg.ema_decay",
+    "apg.gradient_norm": "apg.max_grad_norm",
+    "apg.leeway": "apg.termination_slack",
+    "apg.momentum": "apg.adam_b1",
+    "apg.second_momentum": "apg.adam_b2",
+    "ppo.average": "ppo.ema_decay",
+    "ppo.clip": "ppo.clip_range",
+    "ppo.clip_apart": "ppo.separate_grad_clipping",
+    "ppo.gradient_norm": "ppo.max_grad_norm",
+}
+
 
 @pytree
 class Task:
@@ -95,12 +108,13 @@ def load_task(task: str | Path, edits: dict[str, Any] | None = None) -> Task:
             f"task: {name!r} is no preset. Allowed: {', '.join(preset_names())}, or a .toml file."
             + (f" Did you mean {hint}?" if hint else "")
         )
-    complete = document.plain(document.read(Task, _with_vehicle(data), where))
+    task_read = _read(data, where)
     if not edits:
-        return document.read(Task, complete, where)
+        return task_read
+    complete = document.plain(task_read)
     for path, value in edits.items():
         complete = _edited(complete, path, value)
-    return document.read(Task, complete)
+    return _read(complete)
 
 
 def _preset(name: str) -> dict[str, Any]:
@@ -126,7 +140,7 @@ def read_task_text(text: str, where: str) -> Task:
     Raises:
         BadInput: not a task.
     """
-    return document.read(Task, document.parse(text, where), where)
+    return _read(document.parse(text, where), where)
 
 
 def write_task(task: Task) -> str:
@@ -135,9 +149,17 @@ def write_task(task: Task) -> str:
     return document.write(task, sources, heading=f"flytune task {task.name}: value  # unit; allowed; source")
 
 
-def _with_vehicle(data: dict[str, Any]) -> dict[str, Any]:
+def _read(data: dict[str, Any], where: str = "") -> Task:
+    """The task of complete tables, in which `vehicle` may be a name.
+
+    Raises:
+        BadInput: not a task, or one with a key that has another name now.
+    """
+    for old, new in RENAMED.items():
+        if nested.look_up(data, old) is not None:
+            raise BadInput(f"{f'{where}: ' if where else ''}{old}: is called {new} now. Write {new} instead.")
     vehicle = data.get("vehicle")
-    return {**data, "vehicle": vehicle_table(vehicle)} if isinstance(vehicle, str) else data
+    return document.read(Task, {**data, "vehicle": vehicle_table(vehicle)} if isinstance(vehicle, str) else data, where)
 
 
 def _edited(data: dict[str, Any], path: str, value: Any) -> dict[str, Any]:

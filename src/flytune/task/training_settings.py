@@ -57,13 +57,13 @@ class PpoSettings:
     epochs: Count = 12  # R17
     minibatch: Annotated[Whole, Ge(2), Unit("samples")] = 128  # R17
     learning_rate: Annotated[Real, Gt(0), Unit("1")] = 2e-4  # R17
-    clip: Annotated[Real, Gt(0), Lt(1), Unit("1")] = 0.15  # R17
+    clip_range: Annotated[Real, Gt(0), Lt(1), Unit("1")] = 0.15  # R17
     discount: Annotated[Real, Gt(0), Le(1), Unit("1")] = 0.99  # R17: Stable-Baselines3
     gae_lambda: Share = 0.95
     value_weight: Annotated[Real, Ge(0), Unit("1")] = 0.5
     entropy_weight: Annotated[Real, Ge(0), Unit("1")] = 0.0
     max_grad_norm: Annotated[Real, Gt(0), Unit("1")] = 0.5
-    clip_apart: bool = False  # max_grad_norm applies to the gradients of actor and critic separately
+    separate_grad_clipping: bool = False  # max_grad_norm applies to the gradients of actor and critic separately
     final_learning_rate: Share = 1.0  # as a share of the first, reached linearly
     input_scale: tuple[Positive, Positive, Positive, Positive, Positive] = (1.0, 1.0, 1.0, 1.0, 1.0)  # per block of R7
     initial_log_std: Annotated[Real, Unit("1")] = 0.0

@@ -254,7 +254,7 @@ def loss(settings: PpoSettings, parameters: Parameters, batch: Batch) -> tuple[A
     advantage = (advantage - jnp.mean(advantage)) / (jnp.std(advantage, ddof=1) + 1e-8)
     logarithm = log_probability(parameters.actor(batch.observation), parameters.log_std, batch.action)
     ratio = jnp.exp(logarithm - batch.log_probability)
-    clipped = jnp.clip(ratio, 1 - settings.clip, 1 + settings.clip)
+    clipped = jnp.clip(ratio, 1 - settings.clip_range, 1 + settings.clip_range)
     policy_loss = -jnp.mean(jnp.minimum(ratio * advantage, clipped * advantage))
     value_loss = jnp.mean((parameters.critic(batch.observation)[..., 0] - batch.target) ** 2)
     entropy = jnp.sum(parameters.log_std) + 0.5 * 4 * math.log(2 * math.pi * math.e)
@@ -263,7 +263,7 @@ def loss(settings: PpoSettings, parameters: Parameters, batch: Batch) -> tuple[A
         "loss": total,
         "policy_loss": policy_loss,
         "value_loss": value_loss,
-        "clip_fraction": jnp.mean(jnp.abs(ratio - 1) > settings.clip),
+        "clip_fraction": jnp.mean(jnp.abs(ratio - 1) > settings.clip_range),
         "approximate_kl": jnp.mean(ratio - 1 - (logarithm - batch.log_probability)),
     }
     return total, parts
@@ -281,7 +281,7 @@ def _optimiser(settings: PpoSettings, parameters: Parameters) -> optax.GradientT
 
 def _clipping(settings: PpoSettings, parameters: Parameters) -> optax.GradientTransformation:
     """Gradients no longer than `max_grad_norm`: as a whole, or the critic's and the rest each for itself."""
-    if not settings.clip_apart:
+    if not settings.separate_grad_clipping:
         return optax.clip_by_global_norm(settings.max_grad_norm)
     theirs = jax.tree.map(jnp.zeros_like, parameters)
     theirs = dataclasses.replace(theirs, critic=jax.tree.map(jnp.ones_like, parameters.critic))

@@ -108,7 +108,7 @@ def make_model(settings: PpoSettings, environments: Any, seed: int) -> Any:
         n_epochs=settings.epochs,
         batch_size=settings.minibatch,
         learning_rate=float(settings.learning_rate),
-        clip_range=float(settings.clip),
+        clip_range=float(settings.clip_range),
         gamma=float(settings.discount),
         gae_lambda=float(settings.gae_lambda),
         vf_coef=float(settings.value_weight),

@@ -188,7 +188,7 @@ TRAINERS = {
             settings_field="ppo",
             extra="sb3",
             packages=("gymnasium", "torch", "stable_baselines3"),
-            missing_settings=("clip_apart", "final_learning_rate", "input_scale"),
+            missing_settings=("separate_grad_clipping", "final_learning_rate", "input_scale"),
         ),
     )
 }
