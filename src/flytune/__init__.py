@@ -9,7 +9,7 @@
 Each command of the command line is one call here:
 
 - train: `train`; evaluate: `evaluate`, or `find_controller`, `fly` and `judge` one by one
-- compare, report: `evaluate_all`, then `compare` of the judgements, `write_comparison` and `write_report`
+- compare, report: `evaluate_all`, then `compare` of the judgements, and `write_report`
 - tune, rules: `tune`, `load_rules`; reproduce: `reproduce`; bench: `bench`
 - export: `save_onnx`, `save_policy`; show: `load_task`, `write_task`
 
@@ -44,8 +44,6 @@ if TYPE_CHECKING:
     from flytune.export.untrusted.onnx_controller import load_onnx as load_onnx
     from flytune.physics.vehicle import Vehicle as Vehicle
     from flytune.physics.vehicle import load_vehicle as load_vehicle
-    from flytune.report.comparison import write_comparison as write_comparison
-    from flytune.report.report import Entry as Entry
     from flytune.report.report import write_report as write_report
     from flytune.reproduction.reproduction import Reproduction as Reproduction
     from flytune.reproduction.reproduction import reproduce as reproduce
@@ -75,8 +73,7 @@ _MODULES = {
     "flytune.export.onnx": ("save_onnx",),
     "flytune.export.untrusted.onnx_controller": ("load_onnx",),
     "flytune.physics.vehicle": ("Vehicle", "load_vehicle"),
-    "flytune.report.comparison": ("write_comparison",),
-    "flytune.report.report": ("Entry", "write_report"),
+    "flytune.report.report": ("write_report",),
     "flytune.reproduction.reproduction": ("Reproduction", "reproduce"),
     "flytune.runs.find": ("FoundController", "find_controller"),
     "flytune.task.task": ("Task", "load_task", "write_task"),

@@ -51,7 +51,7 @@ def difference(comparison, metric, name=None):
 # --- the difference of a pair ---
 
 
-def test_a_difference_is_the_pilot_less_the_reference_trial_by_trial(make_judgement):
+def test_a_difference_is_the_controller_less_the_reference_trial_by_trial(make_judgement):
     # 3.5 - 3, 4 - 4, 1 - 2, 6 - 5, 9.25 - 9 = 0.5, 0, -1, 1, 0.25: in order -1, 0, 0.25, 0.5, 1
     reference = make_judgement("apg", settling=[3, 4, 2, 5, 9])
     controller = make_judgement("pid", settling=[3.5, 4, 1, 6, 9.25])
@@ -84,7 +84,7 @@ def test_a_crash_counts_even_where_the_metric_does_not_apply_to_the_other():
 
 
 @given(st.lists(st.tuples(*[st.one_of(st.floats(0, 100), st.sampled_from([INFINITE, NOT_APPLICABLE]))] * 2)))
-def test_exchanging_the_two_pilots_turns_every_sign(pairs):
+def test_exchanging_the_two_controllers_turns_every_sign(pairs):
     one, other = np.array(pairs, dtype=float).reshape(-1, 2).T
     np.testing.assert_array_equal(paired_difference(one, other), -paired_difference(other, one))
 
@@ -172,7 +172,7 @@ def test_the_median_lies_in_its_interval_and_all_three_were_measured(values):
 # --- the comparison ---
 
 
-def test_every_pilot_but_the_reference_differs_from_it_in_every_metric(make_judgement):
+def test_every_controller_but_the_reference_differs_from_it_in_every_metric(make_judgement):
     controllers = [make_judgement(name, settling=[time, time]) for name, time in (("a", 1), ("b", 3), ("c", 7))]
     comparison = compare(controllers, reference=1)
     assert comparison.names == ("a", "b", "c")
@@ -231,7 +231,7 @@ def test_the_dictionary_has_the_published_keys_and_is_json(make_judgement):
         ([{"name": ""}, {"name": ""}], ("controller", "controller (2)")),
     ],
 )
-def test_pilots_of_one_name_are_told_apart(make_judgement, flown, names):
+def test_controllers_of_one_name_are_told_apart(make_judgement, flown, names):
     comparison = compare([make_judgement(**{"name": "pid", **changes}) for changes in flown])
     assert comparison.names == names
     assert {one.name for one in comparison.differences} == set(names[1:])
@@ -255,13 +255,13 @@ def test_trials_that_are_not_the_same_are_refused_in_one_line_that_says_what_dif
 
 
 @pytest.mark.parametrize("number", [0, 1])
-def test_fewer_than_two_pilots_are_refused(make_judgement, number):
+def test_fewer_than_two_controllers_are_refused(make_judgement, number):
     with pytest.raises(BadInput, match=r"^compare: .* Allowed: two or more"):
         compare([make_judgement()] * number)
 
 
 @pytest.mark.parametrize("reference", [-1, 2])
-def test_a_reference_that_is_no_pilot_is_refused(make_judgement, reference):
+def test_a_reference_that_is_no_controller_is_refused(make_judgement, reference):
     with pytest.raises(BadInput, match=r"^reference: -?\d is not allowed"):
         compare([make_judgement(), make_judgement()], reference=reference)
 
@@ -299,7 +299,7 @@ def test_an_interval_that_holds_zero_says_both_ways(make_judgement):
     )
 
 
-def test_a_pilot_that_leaves_unsettled_what_the_other_settles_is_infinitely_later(make_judgement):
+def test_a_controller_that_leaves_unsettled_what_the_other_settles_is_infinitely_later(make_judgement):
     controllers = [make_judgement("apg", settling=[1.0] * 9), make_judgement("pid", settling=[INFINITE] * 9)]
     assert "pid settles infinitely later than apg (95 % interval likewise), later in 9 of 9 trials" in str(
         compare(controllers)
@@ -307,12 +307,12 @@ def test_a_pilot_that_leaves_unsettled_what_the_other_settles_is_infinitely_late
     assert "apg settles infinitely earlier than pid" in str(compare(controllers[::-1]))
 
 
-def test_equal_pilots_are_said_to_be_equal(make_judgement):
+def test_equal_controllers_are_said_to_be_equal(make_judgement):
     table = compare([make_judgement("apg"), make_judgement("pid")]).table()
     assert "pid settles as early as apg (95 % interval 0 to 0), later in 0 of 5 trials, equal in 5" in table
 
 
-def test_the_table_has_a_row_per_pilot_under_the_conditions_they_share(make_judgement):
+def test_the_table_has_a_row_per_controller_under_the_conditions_they_share(make_judgement):
     lost = np.array([True, False, False, False, False])
     long = "runs/" + "x" * 60
     table = compare([make_judgement("apg"), make_judgement(long, crashed=lost, violated={"speed": ~lost})]).table()

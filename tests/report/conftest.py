@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from flytune.control.policy import Policy, make_network
+from flytune.evaluation.evaluate import Evaluation
 from flytune.evaluation.fly import fly
 from flytune.evaluation.judge import judge
-from flytune.report.report import Entry
 from flytune.task.observation import SIZE
 from flytune.task.task import load_task
 
@@ -50,8 +50,8 @@ def curve():
 
 
 @pytest.fixture(scope="session")
-def make_entry(task, flights, curve):
-    """Factory of entries from the real flights; arguments replace fields of the entry, or of the flights."""
+def make_evaluation(task, flights, curve):
+    """Factory of evaluations from the real flights; arguments replace fields of the evaluation, or of the flights."""
     fields = {field.name for field in dataclasses.fields(flights)} - {"task", "name"}
 
     def make(**changes):
@@ -69,7 +69,7 @@ def make_entry(task, flights, curve):
             "metrics": curve,
             "about": {"trainer": "none", "seed": "0"},
         }
-        return Entry(**(given | {key: value for key, value in changes.items() if key not in fields}))
+        return Evaluation(**(given | {key: value for key, value in changes.items() if key not in fields}))
 
     return make
 

@@ -13,20 +13,20 @@ from flytune.task.task import write_task
 
 @pytest.fixture
 def read(tmp_path):
-    """Writes the report of some entries and reads it."""
+    """Writes the report of some evaluations and reads it."""
 
-    def write_and_read(*entries):
-        write_report(tmp_path / "report.html", entries)
+    def write_and_read(*evaluations):
+        write_report(tmp_path / "report.html", evaluations)
         return Reader((tmp_path / "report.html").read_text())
 
     return write_and_read
 
 
 @pytest.fixture(scope="session")
-def hostile_entry(make_entry, task, flights, curve):
-    """An entry in which everything that a user names is an attack."""
+def hostile_evaluation(make_evaluation, task, flights, curve):
+    """An evaluation in which everything that a user names is an attack."""
     rows = [row | {"terms": {HOSTILE: 0.1}, "terminations": {HOSTILE: 1, HOSTILE + "never": 0}} for row in curve]
-    return make_entry(
+    return make_evaluation(
         name=HOSTILE,
         task=dataclasses.replace(task, name=HOSTILE, sources={"horizon": HOSTILE}),
         vehicle=HOSTILE,
@@ -38,7 +38,7 @@ def hostile_entry(make_entry, task, flights, curve):
 
 
 @pytest.fixture(scope="session")
-def odd_entries(make_entry, task, flights, keep):
+def odd_evaluations(make_evaluation, task, flights, keep):
     """Entries at the edge of what there is to show, by what is odd about them."""
     on_target = np.broadcast_to(flights.target_position, flights.position.shape)
     nobody = np.zeros(flights.trials, dtype=bool)
@@ -46,22 +46,22 @@ def odd_entries(make_entry, task, flights, keep):
     lost[:, 50:] = np.nan
     level = np.broadcast_to([0.0, 0.0, 0.0, 1.0], flights.attitude.shape)
     return {
-        "without a curve": make_entry(metrics=None),
-        "an empty curve": make_entry(metrics=[]),
-        "a curve of nulls": make_entry(metrics=[{"update": 1, "steps": None, "reward": None, "terms": None}]),
-        "one update": make_entry(metrics=[{"update": 1, "steps": 16384, "reward": 0.4}]),
-        "a single trial": make_entry(**keep([1])),
-        "everything crashed": make_entry(crashed=np.ones(flights.trials, dtype=bool)),
-        "states that are not finite": make_entry(position=lost),
-        "no termination": make_entry(task=dataclasses.replace(task, termination={}), margins={}),
-        "no speed bound": make_entry(speed_bound=None),
-        "everything settled at once": make_entry(position=on_target, attitude=level, crashed=nobody),
-        "nothing known": make_entry(about={}),
+        "without a curve": make_evaluation(metrics=None),
+        "an empty curve": make_evaluation(metrics=[]),
+        "a curve of nulls": make_evaluation(metrics=[{"update": 1, "steps": None, "reward": None, "terms": None}]),
+        "one update": make_evaluation(metrics=[{"update": 1, "steps": 16384, "reward": 0.4}]),
+        "a single trial": make_evaluation(**keep([1])),
+        "everything crashed": make_evaluation(crashed=np.ones(flights.trials, dtype=bool)),
+        "states that are not finite": make_evaluation(position=lost),
+        "no termination": make_evaluation(task=dataclasses.replace(task, termination={}), margins={}),
+        "no speed bound": make_evaluation(speed_bound=None),
+        "everything settled at once": make_evaluation(position=on_target, attitude=level, crashed=nobody),
+        "nothing known": make_evaluation(about={}),
     }
 
 
 SENTENCES = {
-    "without a curve": "This policy comes without a training curve.",
+    "without a curve": "This controller comes without a training curve.",
     "an empty curve": "The training left no numbers that could be drawn.",
     "a curve of nulls": "The training left no numbers that could be drawn.",
     "one update": "reward per step",
@@ -75,28 +75,28 @@ SENTENCES = {
 }
 
 
-def test_the_page_shows_the_numbers_of_the_judgement(read, make_entry):
-    entry = make_entry()
-    page = read(entry)
-    axes = entry.judgement.to_dict()["axes"]
+def test_the_page_shows_the_numbers_of_the_judgement(read, make_evaluation):
+    evaluation = make_evaluation()
+    page = read(evaluation)
+    axes = evaluation.judgement.to_dict()["axes"]
     assert f"{axes['yaw']['steady_state_error']['median'] * 180 / np.pi:.2f}" in page.text
     assert f"{axes['x']['steady_state_error']['median'] * 1e3:.1f}" in page.text
     assert f"{axes['z']['settled']}/12" in page.text
-    assert f"speed {np.count_nonzero(entry.judgement.violated['speed'])}" in page.text
+    assert f"speed {np.count_nonzero(evaluation.judgement.violated['speed'])}" in page.text
 
 
-def test_the_page_holds_the_task_with_every_number(read, make_entry, task):
-    text = read(make_entry()).text
+def test_the_page_holds_the_task_with_every_number(read, make_evaluation, task):
+    text = read(make_evaluation()).text
     assert all(line in text for line in write_task(task).splitlines())
 
 
-def test_the_page_of_one_policy_has_a_figure_of_each_kind(read, make_entry):
-    kinds = [{trace["type"] for trace in figure["data"]} for figure in read(make_entry()).figures]
+def test_the_page_of_one_controller_has_a_figure_of_each_kind(read, make_evaluation):
+    kinds = [{trace["type"] for trace in figure["data"]} for figure in read(make_evaluation()).figures]
     assert kinds == [{"scatter"}, {"box"}, {"scatter"}, {"scatter3d"}, {"scatter"}]
 
 
-def test_the_page_loads_nothing_from_the_network(read, make_entry):
-    page = read(make_entry(), make_entry())
+def test_the_page_loads_nothing_from_the_network(read, make_evaluation):
+    page = read(make_evaluation(), make_evaluation())
     tags = {tag for tag, _ in page.elements}
     assert not tags & {"link", "img", "iframe", "object", "embed", "base", "video", "audio", "source"}
     for _, attributes in page.elements:
@@ -107,15 +107,15 @@ def test_the_page_loads_nothing_from_the_network(read, make_entry):
     assert "http" not in policy
 
 
-def test_every_link_leads_to_one_place_on_the_page(read, make_entry):
-    page = read(make_entry(), make_entry(metrics=None), make_entry())
+def test_every_link_leads_to_one_place_on_the_page(read, make_evaluation):
+    page = read(make_evaluation(), make_evaluation(metrics=None), make_evaluation())
     places = [attributes["id"] for _, attributes in page.elements if "id" in attributes]
     assert len(places) == len(set(places))
     assert {attributes["href"][1:] for _, attributes in page.elements if "href" in attributes} <= set(places)
 
 
-def test_names_that_are_markup_come_out_as_text(read, hostile_entry):
-    page = read(hostile_entry, hostile_entry)
+def test_names_that_are_markup_come_out_as_text(read, hostile_evaluation):
+    page = read(hostile_evaluation, hostile_evaluation)
     scripts = [attributes for tag, attributes in page.elements if tag == "script"]
     assert len(scripts) == len(page.figures) + 2  # the figures' data, plotly.js and the page's own
     assert not any(name.startswith("on") for _, attributes in page.elements for name in attributes)
@@ -124,36 +124,36 @@ def test_names_that_are_markup_come_out_as_text(read, hostile_entry):
     assert html.escape("<script>") in page.texts_of_figures()
 
 
-def test_no_text_of_a_figure_can_end_its_script_element(read, hostile_entry, tmp_path):
-    read(hostile_entry)
+def test_no_text_of_a_figure_can_end_its_script_element(read, hostile_evaluation, tmp_path):
+    read(hostile_evaluation)
     page = (tmp_path / "report.html").read_text()
     begin = page.index('<script type="application/json">') + len('<script type="application/json">')
     assert not set("<>&") & set(page[begin : page.index("</script>", begin)])
 
 
 @pytest.mark.parametrize("odd", SENTENCES)
-def test_what_cannot_be_drawn_is_said(read, odd_entries, odd):
-    page = read(odd_entries[odd])
+def test_what_cannot_be_drawn_is_said(read, odd_evaluations, odd):
+    page = read(odd_evaluations[odd])
     assert SENTENCES[odd] in page.text + page.texts_of_figures()
     assert all(figure["data"] for figure in page.figures)
 
 
-def test_several_policies_are_compared_on_top_and_their_differing_numbers_listed(read, make_entry, task):
+def test_several_controllers_are_compared_on_top_and_their_differing_numbers_listed(read, make_evaluation, task):
     faster = dataclasses.replace(task, name="faster", horizon=700)
-    page = read(make_entry(name="one"), make_entry(name="two", task=faster))
-    assert "2 policies compared" in page.text
+    page = read(make_evaluation(name="one"), make_evaluation(name="two", task=faster))
+    assert "2 controllers compared" in page.text
     assert page.text.index("two") < page.text.index("How their tasks differ") < page.text.index("on all four axes")
     assert "horizon500700" in page.text
     assert len(page.figures) == 1 + 2 * 5
 
 
-def test_policies_of_the_same_task_are_said_to_share_it(read, make_entry):
-    assert "All were given the same task, number by number." in read(make_entry(), make_entry()).text
+def test_controllers_of_the_same_task_are_said_to_share_it(read, make_evaluation):
+    assert "All were given the same task, number by number." in read(make_evaluation(), make_evaluation()).text
 
 
-def test_a_report_replaces_an_earlier_one_and_leaves_nothing_beside_it(make_entry, tmp_path):
+def test_a_report_replaces_an_earlier_one_and_leaves_nothing_beside_it(make_evaluation, tmp_path):
     (tmp_path / "report.html").write_text("an earlier one")
-    write_report(tmp_path / "report.html", [make_entry()])
+    write_report(tmp_path / "report.html", [make_evaluation()])
     assert (tmp_path / "report.html").read_text().startswith("<!DOCTYPE html>")
     assert [path.name for path in tmp_path.iterdir()] == ["report.html"]
 
@@ -167,17 +167,17 @@ def test_a_report_replaces_an_earlier_one_and_leaves_nothing_beside_it(make_entr
         ("x" * 300 + ".html", "cannot be written"),
     ],
 )
-def test_a_place_that_cannot_be_written_is_refused_in_one_line(make_entry, tmp_path, place, says):
+def test_a_place_that_cannot_be_written_is_refused_in_one_line(make_evaluation, tmp_path, place, says):
     (tmp_path / "folder").mkdir()
     (tmp_path / "file").touch()
     with pytest.raises(BadInput, match=says) as error:
-        write_report(tmp_path / place, [make_entry()])
+        write_report(tmp_path / place, [make_evaluation()])
     assert "\n" not in str(error.value)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["file", "folder"]
 
 
-def test_a_report_without_a_policy_is_refused(tmp_path):
-    with pytest.raises(BadInput, match="no policy"):
+def test_a_report_without_a_controller_is_refused(tmp_path):
+    with pytest.raises(BadInput, match="no controller"):
         write_report(tmp_path / "report.html", [])
 
 
@@ -221,30 +221,30 @@ def look_at(browser, path):
 
 
 @pytest.mark.browser
-def test_a_browser_draws_every_figure_without_an_error_or_a_request(browser, make_entry, tmp_path):
-    write_report(tmp_path / "report.html", [make_entry(name="one"), make_entry(name="two")])
+def test_a_browser_draws_every_figure_without_an_error_or_a_request(browser, make_evaluation, tmp_path):
+    write_report(tmp_path / "report.html", [make_evaluation(name="one"), make_evaluation(name="two")])
     assert look_at(browser, tmp_path / "report.html") == 11
 
 
 @pytest.mark.browser
-def test_a_browser_draws_the_odd_cases_too(browser, odd_entries, tmp_path):
-    entries = [dataclasses.replace(entry, name=odd) for odd, entry in odd_entries.items()]
-    write_report(tmp_path / "report.html", entries)
+def test_a_browser_draws_the_odd_cases_too(browser, odd_evaluations, tmp_path):
+    evaluations = [dataclasses.replace(evaluation, name=odd) for odd, evaluation in odd_evaluations.items()]
+    write_report(tmp_path / "report.html", evaluations)
     # the comparison, and five of each but for three without a curve, two without boxes, one without margins
-    assert look_at(browser, tmp_path / "report.html") == 1 + 5 * len(entries) - 6
+    assert look_at(browser, tmp_path / "report.html") == 1 + 5 * len(evaluations) - 6
 
 
 @pytest.mark.browser
-def test_a_browser_shows_hostile_names_as_text(browser, hostile_entry, tmp_path):
-    write_report(tmp_path / "report.html", [hostile_entry, hostile_entry])
+def test_a_browser_shows_hostile_names_as_text(browser, hostile_evaluation, tmp_path):
+    write_report(tmp_path / "report.html", [hostile_evaluation, hostile_evaluation])
     look_at(browser, tmp_path / "report.html")
     assert browser.evaluate("document.querySelector('h2').textContent") == HOSTILE
     assert browser.evaluate("document.querySelector('.legendtext').textContent").startswith("<script>alert(1)</script>")
 
 
 @pytest.mark.browser
-def test_the_page_offers_no_upload_and_fits_a_narrow_window(browser, make_entry, tmp_path):
-    write_report(tmp_path / "report.html", [make_entry(), make_entry(name="y" * 200)])
+def test_the_page_offers_no_upload_and_fits_a_narrow_window(browser, make_evaluation, tmp_path):
+    write_report(tmp_path / "report.html", [make_evaluation(), make_evaluation(name="y" * 200)])
     browser.call("Emulation.setDeviceMetricsOverride", width=400, height=800, deviceScaleFactor=1, mobile=False)
     try:
         look_at(browser, tmp_path / "report.html")

@@ -76,7 +76,7 @@ def compare(controllers: Controllers, /, *, options: CompareOptions = CompareOpt
     """Fly two or more controllers from the same initial conditions, and judge them side by side."""
     from flytune.evaluation.comparison import compare
     from flytune.evaluation.evaluate import evaluate_all
-    from flytune.report.comparison import write_comparison
+    from flytune.report.report import write_report
 
     check_outputs(options.out, options.flights)
     first, *others = controllers
@@ -91,7 +91,7 @@ def compare(controllers: Controllers, /, *, options: CompareOptions = CompareOpt
     if options.out is not None:
         make_folder(options.out)
         write_json(options.out / "comparison.json", comparison.to_dict())
-        write_comparison(options.out / "comparison.html", evaluations, comparison)
+        write_report(options.out / "comparison.html", evaluations, comparison)
 
 
 def report(controllers: Controllers, /, *, options: ReportOptions = ReportOptions()) -> None:

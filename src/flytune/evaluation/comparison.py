@@ -4,7 +4,7 @@ import dataclasses
 from collections.abc import Sequence
 
 from flytune.errors import BadInput
-from flytune.evaluation.comparison_table import MAY_DIFFER, comparison_table
+from flytune.evaluation.comparison_table import MAY_DIFFER, comparison_text
 from flytune.evaluation.difference import METRICS, Difference, compare_metric
 from flytune.evaluation.judge import Judgement
 
@@ -43,7 +43,7 @@ class Comparison:
 
     def table(self) -> str:
         """The comparison for a terminal: a row per controller, then the differences in words."""
-        return comparison_table(self.judgements, self.reference, self.differences)
+        return comparison_text(self.judgements, self.reference, self.differences)
 
     __str__ = table
 

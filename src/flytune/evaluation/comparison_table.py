@@ -1,21 +1,20 @@
-"""The comparison as text for a terminal: a row per controller, then the paired differences in plain words."""
+"""The comparison in tables and words: a row per controller, a row per metric, and sentences on what sets them apart."""
 
+import dataclasses
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
-from flytune.evaluation.difference import Difference
+from flytune.evaluation.difference import METRICS, Difference, Metric
 from flytune.evaluation.judge import CHANNELS, Judgement
+from flytune.tables import NULL, Cell, Column, Table
 
 LABELS = {"simulator": "world"}  # of fields whose name in the output is older than their name in the code
 MAY_DIFFER = ("simulator", "task", "vehicle")  # between controllers whose trials are the same
 LONGEST = 30  # characters of a name in the table
 
-HEADER = (
-    "       settled trials         settling [s]    overshoot   final error    peak      action        crossed",
-    "    x    y    z  yaw  pos   median     p95          [%]   [mm]  [deg]   [m/s]    rms  change   a bound  crashed",
-)
 NOTE = (
     "Differences are medians over the trials, each with itself: infinite where one controller settles, or flies on, and the",
     "other does not. Intervals are for these controllers as they are; another training of the same kind would differ more.",
@@ -42,34 +41,114 @@ WORDS = {  # metric -> (what a controller does, with as much, unit, factor to th
 }
 
 
-def comparison_table(judgements: Sequence[Judgement], reference: int, differences: Sequence[Difference]) -> str:
-    """The table of all controllers, and beneath it what sets each of them apart from the reference."""
-    against = judgements[reference].name
-    width = max(10, *(len(_short(judgement.name)) for judgement in judgements))
-    lines = [conditions(judgements), "", *(" " * width + line for line in HEADER)]
-    lines += [f"{_short(judgement.name):<{width}}{_row(judgement)}" for judgement in judgements]
+TITLES = {  # field of the judgement -> in words
+    "settling_time": "settling time",
+    "overshoot": "overshoot",
+    "steady_state_error": "steady-state error",
+    "rms_error": "RMS error",
+    "peak_speed": "peak speed",
+    "action_rms": "action, RMS",
+    "action_total_variation": "action, change",
+}
+SCALES = {"s": ("s", 1.0), "m": ("mm", 1e3), "rad": ("deg", math.degrees(1)), "m/s": ("m/s", 1.0), "1": ("1", 1.0)}
+
+
+def title(metric: Metric) -> str:
+    """A metric in words."""
+    return " ".join(filter(None, [metric.channel, TITLES[metric.field]]))
+
+
+def unit(metric: Metric) -> tuple[str, float]:
+    """The unit a metric is shown in, and its factor."""
+    return ("%", 100.0) if metric.field == "overshoot" else SCALES[metric.unit]
+
+
+@dataclasses.dataclass(frozen=True)
+class _Controller:
+    """One row of the comparison table."""
+
+    number: int
+    judgement: Judgement
+    judged: Mapping[str, Any]  # Judgement.to_dict
+
+    @property
+    def crossed(self) -> int:
+        """Trials that crossed some bound."""
+        nobody = np.zeros(self.judgement.trials, dtype=bool)
+        return int(np.count_nonzero(np.any([nobody, *self.judgement.violated.values()], axis=0)))
+
+
+def _settled(channel: str, title: str) -> Column:
+    return Column(title, lambda row: row.judgement.settled(channel), group="settled trials    ", width=5)
+
+
+COLUMNS = (  # spaces at the ends of a heading place it in a terminal
+    Column("", lambda row: controller_cell(row.number, row.judgement.name), align="left", width=10),
+    *(_settled(channel, channel[:3]) for channel in CHANNELS),
+    Column("median", lambda row: row.judged["position"]["settling_time"]["median"], group="settling [s]", decimals=2,
+           width=9),
+    Column("p95", lambda row: row.judged["position"]["settling_time"]["p95"], group="settling [s]", decimals=2, width=8),
+    Column("[%]", lambda row: row.judged["position"]["overshoot"]["median"], group="overshoot", decimals=1, scale=100.0,
+           width=13),
+    Column("[mm]", lambda row: row.judged["position"]["steady_state_error"]["median"], group="final error", decimals=1,
+           scale=1e3, width=7),
+    Column("[deg]", lambda row: row.judged["axes"]["yaw"]["steady_state_error"]["median"], group="final error",
+           decimals=2, scale=math.degrees(1), width=7),
+    Column("[m/s]", lambda row: row.judged["peak_speed"]["median"], group="peak", decimals=2, width=8),
+    Column("rms", lambda row: row.judged["action"]["rms"], group="action   ", decimals=3, width=7),
+    Column("change", lambda row: row.judged["action"]["total_variation"], group="action   ", decimals=4, width=8),
+    Column("a bound", lambda row: row.crossed, group="     crossed", width=10),
+    Column("crashed", lambda row: row.judged["crashed"], width=9),
+)  # fmt: skip
+
+
+def comparison_table(judgements: Sequence[Judgement]) -> Table:
+    """The table of several controllers, one row for each."""
+    rows = [_Controller(number, judgement, judgement.to_dict()) for number, judgement in enumerate(judgements, start=1)]
+    return Table.of(COLUMNS, rows, style="dense")
+
+
+def comparison_text(judgements: Sequence[Judgement], reference: int, differences: Sequence[Difference]) -> str:
+    """The comparison for a terminal: the table, and beneath it what sets each controller apart from the reference."""
+    lines = [conditions(judgements), "", comparison_table(judgements).text()]
     for judgement in judgements:
-        found = sentences([one for one in differences if one.name == judgement.name], against)
+        found = sentences([one for one in differences if one.name == judgement.name], judgements[reference].name)
         lines += ["", *("    " * (index > 0) + text for index, text in enumerate(found))] if found else []
     return "\n".join([*lines, "", *NOTE])
 
 
-def _row(judgement: Judgement) -> str:
-    """One line of the table, under HEADER."""
-    told = judgement.to_dict()
-    position, yaw, action = told["position"], told["axes"]["yaw"], told["action"]
-    settling = position["settling_time"]
-    crossed = np.any([np.zeros(judgement.trials, dtype=bool), *judgement.violated.values()], axis=0)
+def differences_table(judgements: Sequence[Judgement], reference: int, differences: Sequence[Difference]) -> Table:
+    """One row per metric, one column per controller but the reference: the median difference, its interval, the trials."""
+    names = [judgement.name for judgement in judgements]
+    others = [Column(f"{n} {name}", align="left") for n, name in enumerate(names, start=1) if n != reference + 1]
+    rows = []
+    for metric in METRICS:
+        symbol, scale = unit(metric)
+        found = (_difference_cell(one, scale) for one in differences if one.metric is metric)
+        rows.append((f"{title(metric)} [{symbol}]", *found))
+    return Table.plain([f"less {names[reference]}", *others], rows, style="dense narrow")
+
+
+def _difference_cell(difference: Difference, scale: float) -> str:
+    left_out = f" ({difference.left_out} left out)" if difference.left_out else ""
     return (
-        f"{''.join(f'{judgement.settled(channel):>5}' for channel in CHANNELS)}"
-        f"{_number(settling['median'], 2):>9}{_number(settling['p95'], 2):>8}"
-        f"{_number(position['overshoot']['median'], 1, 100.0):>13}"
-        f"{_number(position['steady_state_error']['median'], 1, 1e3):>7}"
-        f"{_number(yaw['steady_state_error']['median'], 2, math.degrees(1)):>7}"
-        f"{_number(told['peak_speed']['median'], 2):>8}"
-        f"{_number(action['rms'], 3):>7}{_number(action['total_variation'], 4):>8}"
-        f"{np.count_nonzero(crossed):>10}{told['crashed']:>9}"
+        f"{signed(difference.median * scale)}\n{signed(difference.low * scale)} to {signed(difference.high * scale)}"
+        f"\n{difference.better} : {difference.worse}{left_out}"
     )
+
+
+def signed(value: float) -> str:
+    """A difference with its sign, to three digits."""
+    if math.isnan(value):
+        return NULL
+    if math.isinf(value):
+        return ("+" if value > 0 else "\N{MINUS SIGN}") + "\N{INFINITY}"
+    return f"{value:+.3g}".replace("-", "\N{MINUS SIGN}") if value else "0"
+
+
+def controller_cell(number: int, name: str) -> Cell:
+    """A controller's name: in a terminal short, on a page whole and behind its number, which has its colour."""
+    return Cell(text=_short(name), page=name, badge=number)
 
 
 def conditions(judgements: Sequence[Judgement]) -> str:
@@ -130,7 +209,3 @@ def _clause(difference: Difference, against: str, whole: bool) -> str:
 def _short(name: str) -> str:
     """A name for the table; of a long one the end, which is where paths differ."""
     return name if len(name) <= LONGEST else "…" + name[1 - LONGEST :]
-
-
-def _number(value: float | None, decimals: int, scale: float = 1.0) -> str:
-    return "-" if value is None else f"{value * scale:.{decimals}f}"

@@ -11,8 +11,8 @@ from plotly.subplots import make_subplots
 
 from flytune.evaluation import metrics
 from flytune.evaluation.comparison import Comparison
-from flytune.evaluation.comparison_table import WAYS
-from flytune.evaluation.difference import METRICS, Difference, Metric
+from flytune.evaluation.comparison_table import WAYS, title, unit
+from flytune.evaluation.difference import METRICS, Difference
 from flytune.evaluation.flights import Flights
 from flytune.evaluation.judge import CHANNELS
 from flytune.report import plots, style
@@ -30,26 +30,6 @@ BOXES = (
     "peak_speed",
     "action.total_variation",
 )
-NAMES = {
-    "settling_time": "settling time",
-    "overshoot": "overshoot",
-    "steady_state_error": "steady-state error",
-    "rms_error": "RMS error",
-    "peak_speed": "peak speed",
-    "action_rms": "action, RMS",
-    "action_total_variation": "action, change",
-}
-SCALES = {"s": ("s", 1.0), "m": ("mm", 1e3), "rad": ("deg", math.degrees(1)), "m/s": ("m/s", 1.0), "1": ("1", 1.0)}
-
-
-def title(metric: Metric) -> str:
-    """A metric in words."""
-    return " ".join(filter(None, [metric.channel, NAMES[metric.field]]))
-
-
-def unit(metric: Metric) -> tuple[str, float]:
-    """The unit a metric is shown in, and its factor."""
-    return ("%", 100.0) if metric.field == "overshoot" else SCALES[metric.unit]
 
 
 def responses(flights: Sequence[Flights], comparison: Comparison) -> go.Figure:
@@ -65,7 +45,7 @@ def responses(flights: Sequence[Flights], comparison: Comparison) -> go.Figure:
     shown = min(TRIALS_SHOWN, flights[0].trials)
     opacity = 0.16 if len(flights) < 4 else 0.07  # many shades above each other only darken the picture
     for row, channel in enumerate(CHANNELS, start=1):
-        unit = "deg" if channel == "yaw" else "m"
+        symbol = "deg" if channel == "yaw" else "m"
         _, target, band = _course(flights[0], channel)
         errors = []
         for index, flown in enumerate(flights):
@@ -82,8 +62,8 @@ def responses(flights: Sequence[Flights], comparison: Comparison) -> go.Figure:
             "exponentformat": "none",
             "range": [math.log10(low), math.log10(high)],
         }
-        figure.update_yaxes(title_text=f"|{channel} error| [{unit}]", **decades, **place)
-        title_text = f"{'distance' if channel == 'position' else channel} [{unit}]"
+        figure.update_yaxes(title_text=f"|{channel} error| [{symbol}]", **decades, **place)
+        title_text = f"{'distance' if channel == 'position' else channel} [{symbol}]"
         figure.update_yaxes(title_text=title_text, row=row, col=1)
     figure.update_xaxes(range=[0, flights[0].duration], hoverformat=".2f")
     figure.update_xaxes(title_text="time [s]", row=len(CHANNELS))

@@ -20,7 +20,7 @@ Course = Float[np.ndarray, "updates"]
 def learning(rows: Rows | None) -> go.Figure | str:
     """Reward per step and per term, reward per episode, and terminations per cause, over environment steps."""
     if rows is None:
-        return "This policy comes without a training curve."
+        return "This controller comes without a training curve."
     steps = _number(rows, "steps")
     terms = [
         _line(steps, course, name, style.colour(index)) for index, (name, course) in enumerate(_table(rows, "terms"))

@@ -1,134 +1,127 @@
-"""The report: one self-contained page on what one or several policies fly like, and how they came to."""
+"""The report: one self-contained page on how one or several controllers fly, and how they were trained."""
 
-import math
+import dataclasses
 from collections.abc import Sequence
-from html import escape
 from pathlib import Path
+from typing import Any
 
-from flytune.config.files import check_file, write_text
+import numpy as np
+
 from flytune.errors import BadInput
 from flytune.evaluation import metrics
+from flytune.evaluation.comparison import Comparison, compare
+from flytune.evaluation.comparison_table import (
+    comparison_table,
+    conditions,
+    controller_cell,
+    differences_table,
+    sentences,
+)
 from flytune.evaluation.evaluate import Evaluation
-from flytune.report import page, plots, tables
+from flytune.evaluation.table import response_table
+from flytune.report import comparison_plots, envelope, plots, words
 from flytune.report.learning import ends_that_never_came, learning
+from flytune.report.page import write_page
 from flytune.report.style import listed
 
-SECTIONS = {
-    "response": "Step response",
-    "spread": "All trials",
-    "margins": "Margins",
-    "space": "Flights in space",
-    "learning": "Learning",
-    "task": "Task",
-    "about": "About this run",
-}
+SAME_PLACE = 1e-4  # m; another simulator may round the start, which is metres away
 
 
-Entry = Evaluation  # one controller to report on
+def write_report(path: Path, evaluations: Sequence[Evaluation], comparison: Comparison | None = None) -> None:
+    """Write the report of one or several controllers as one HTML file, whole or not at all.
 
-
-def write_report(path: Path, entries: Sequence[Entry]) -> None:
-    """Write the report of one or several policies as one HTML file, whole or not at all.
+    Several controllers are compared first, then each has its section.
 
     Args:
         path: the file; one that is there is replaced.
-        entries: the policies, 1 or more, in the order of the page.
+        evaluations: the controllers, 1 or more, in the order of the page.
+        comparison: of their judgements, in the same order. Without it, controllers that flew the same trials are compared
+            with the first one; for others, the page says why there are no paired differences.
 
     Raises:
-        BadInput: no policy, or the file cannot be written.
+        BadInput: no controller, a comparison of other controllers or other trials, or the file cannot be written.
     """
-    if not entries:
-        raise BadInput("report: no policy. Allowed: one or more. Name a run directory, a policy file or a controller.")
-    check_file(path)
-    write_text(path, _page(entries))
+    if not evaluations:
+        raise BadInput(
+            "report: no controller. Allowed: one or more. Name a run directory, a policy file or a controller."
+        )
+    compared: Comparison | str = comparison or "One controller is compared with no other."
+    if comparison:
+        _check_same_trials(evaluations, comparison)
+    elif len(evaluations) > 1:
+        try:
+            compared = compare([evaluation.judgement for evaluation in evaluations])
+            _check_same_trials(evaluations, compared)
+        except BadInput as reason:
+            compared = f"There are no paired differences, since the controllers flew different trials ({reason})"
+    named = isinstance(compared, Comparison)
+    names = compared.names if named else [evaluation.name for evaluation in evaluations]
+    controllers = [_controller(name, evaluation) for name, evaluation in zip(names, evaluations, strict=True)]
+    several = _comparison(names, evaluations, compared) if len(evaluations) > 1 else None
+    write_page(
+        path, "report.html", controllers=controllers, several=several,
+        position_band=metrics.POSITION_BAND, yaw_band=np.degrees(metrics.YAW_BAND),
+    )  # fmt: skip
 
 
-def _page(entries: Sequence[Entry]) -> str:
-    if len(entries) == 1:
-        entry = entries[0]
-        return page.page(f"{entry.name}: flytune report", f"<h1>{escape(entry.name)}</h1>{_section(entry, 'p1')}")
-    anchors = [f"p{number}" for number in range(1, len(entries) + 1)]
-    sections = "".join(
-        f'<h2 id="{anchor}">{escape(entry.name)}</h2>{_section(entry, anchor)}'
-        for anchor, entry in zip(anchors, entries, strict=True)
-    )
-    return page.page("flytune report", f"{_comparison(anchors, entries)}{sections}")
+def _check_same_trials(evaluations: Sequence[Evaluation], comparison: Comparison) -> None:
+    """Refuse controllers that are not those of the comparison, or whose trials start elsewhere."""
+    number = len(comparison.judgements)
+    if len(evaluations) != number:
+        raise BadInput(
+            f"compare: {len(evaluations)} controllers are not allowed. Allowed: {number}, one per judgement, in order."
+        )
+    first, *others = (one.flights.position[:, 0] - one.flights.target_position for one in evaluations)
+    for name, start in zip(comparison.names[1:], others, strict=True):
+        if not np.allclose(start, first, rtol=0, atol=SAME_PLACE, equal_nan=True):
+            raise BadInput(
+                f"starts: {name} starts elsewhere, seen from its target, than {comparison.names[0]}. "
+                "Allowed: the same for every controller. Fly all of them with one --task."
+            )
 
 
-def _comparison(anchors: Sequence[str], entries: Sequence[Entry]) -> str:
-    """What stands on top of a page of several policies: contents, the table, the overlay, how the tasks differ."""
-    contents = "".join(
-        f'<li><a href="#{anchor}">{escape(entry.name)}</a></li>' for anchor, entry in zip(anchors, entries, strict=True)
-    )
-    judged = [(anchor, entry.name, entry.judgement) for anchor, entry in zip(anchors, entries, strict=True)]
-    share = plots.settled_share([(entry.name, entry.judgement) for entry in entries])
-    return (
-        f"<h1>{len(entries)} policies compared</h1><nav><ol>{contents}</ol></nav>"
-        f"<h3>Side by side</h3>{tables.comparison_table(judged)}{_CAPTIONS['dash']}"
-        f"<h3>Settled by when</h3>{page.drawing(share, _CAPTIONS['share'])}"
-        f"<h3>How their tasks differ</h3>{tables.differences_table([(entry.name, entry.task) for entry in entries])}"
-    )
-
-
-def _section(entry: Entry, anchor: str) -> str:
-    """All there is to say about one policy."""
-    parts = {
-        "response": _response(entry),
-        "spread": page.drawing(plots.spread(entry.judgement), _CAPTIONS["spread"]),
-        "margins": page.drawing(plots.margins(entry.flights, entry.judgement), _CAPTIONS["margins"]),
-        "space": page.drawing(plots.flights_3d(entry.flights), _CAPTIONS["space"]),
-        "learning": _learning(entry),
-        "task": "<p>Every number of the task, its unit, what is allowed, and where it comes from.</p>"
-        f"{tables.task_listing(entry.task)}",
-        "about": tables.definitions(entry.about) if entry.about else '<p class="empty">Nothing is known of it.</p>',
+def _controller(name: str, evaluation: Evaluation) -> dict[str, Any]:
+    """What the section of one controller shows."""
+    flights, judgement = evaluation.flights, evaluation.judgement
+    return {
+        "name": name,
+        "judgement": judgement,
+        "summary": words.summary(judgement),
+        "table": response_table(judgement.to_dict()),
+        "facts": words.facts(judgement, flights.speed_bound),
+        "response": plots.response(flights, judgement, evaluation.task),
+        "motion": plots.motion(flights, judgement),
+        "spread": plots.spread(judgement),
+        "margins": envelope.margins(flights, judgement),
+        "space": envelope.flights_3d(flights),
+        "learning": learning(evaluation.metrics),
+        "never": listed(ends_that_never_came(evaluation.metrics)),
+        "task": words.task_lines(evaluation.task),
+        "about": evaluation.about,
     }
-    links = "".join(f'<a href="#{anchor}-{key}">{SECTIONS[key]}</a>' for key in parts)
-    body = "".join(f'<h3 id="{anchor}-{key}">{SECTIONS[key]}</h3>{html}' for key, html in parts.items())
-    flown = f"on {entry.judgement.task}, vehicle {entry.judgement.vehicle}, world {entry.judgement.simulator}"
-    verdict = tables.verdict(entry.judgement)
-    return f'<p class="quiet">{escape(flown)}</p><p class="lead">{verdict}</p><nav>{links}</nav>{body}'
 
 
-def _response(entry: Entry) -> str:
-    figure = plots.response(entry.flights, entry.judgement, entry.task)
-    return (
-        f"{tables.response_table(entry.judgement)}{_CAPTIONS['dash']}"
-        f"{tables.facts(entry.judgement, entry.flights.speed_bound)}{page.drawing(figure, _CAPTIONS['response'])}"
-    )
-
-
-def _learning(entry: Entry) -> str:
-    caption = _CAPTIONS["learning"]
-    never = ends_that_never_came(entry.metrics)
-    if never:
-        caption += f" No episode was ended by {escape(listed(never))}."
-    return page.drawing(learning(entry.metrics), caption)
-
-
-_CAPTIONS = {
-    "dash": f"""
-<p class="quiet">Quantiles are over all trials; one that failed counts as infinite, and {tables.DASH} says that the
-quantile falls among those.</p>""",
-    "share": """
-Higher and further left is better. A line that stays below 100&nbsp;% belongs to a policy that leaves trials
-unsettled.""",
-    "response": f"""
-The first trials of the evaluation. A dot marks the instant from which a trial stays in the settling band (green,
-±&nbsp;{metrics.POSITION_BAND:g}&nbsp;m and ±&nbsp;{math.degrees(metrics.YAW_BAND):g}&nbsp;deg); dashed is the target,
-red are the bounds of the task, dotted are trials that crashed. Look for a dot on every curve, for curves that cross
-the target (overshoot), and, close up, for offsets that stay.""",
-    "spread": """
-Each dot is a trial, each box holds the middle half of the trials drawn; under it stands how many of all these are.
-Missing are trials that did not settle (settling time), that crashed (all three), or whose step is too small for an
-overshoot. A box that is a line at zero overshoot is a response that never passes its target.""",
-    "margins": """
-How much of each bound of the task is left, over all trials, the tightest bound first. At the red line the bound is
-reached, below it training would have ended the episode. A margin that comes near the line belongs to a bound
-that holds the controller back; a bound whose margin stays far above it does not shape the flight.""",
-    "space": """
-Turn it by dragging. Dots are starts, the red diamond is the target. Look for detours, and for flights that come in
-from one side only.""",
-    "learning": """
-Look for a reward that has stopped rising, for a term that others outweigh (a flat line far below its weight), and for
-terminations that die out; click a name to hide its line.""",
-}
+def _comparison(names: Sequence[str], evaluations: Sequence[Evaluation], compared: Comparison | str) -> dict[str, Any]:
+    """What the page shows of several controllers together; paired differences only of those that flew the same trials."""
+    judgements = [dataclasses.replace(one.judgement, name=name) for name, one in zip(names, evaluations, strict=True)]
+    numbered = [(f"{number} {judgement.name}", judgement) for number, judgement in enumerate(judgements, start=1)]
+    shown = {
+        "table": comparison_table(judgements),
+        "share": plots.settled_share(numbered),
+        "tasks": words.task_differences([(name, one.task) for name, one in zip(names, evaluations, strict=True)]),
+    }
+    if isinstance(compared, str):
+        unknown = ("conditions", "sentences", "reference", "responses", "boxes", "differences")
+        return {**shown, "paired": compared, **dict.fromkeys(unknown)}
+    reference, differences = compared.reference, compared.differences
+    found = [sentences([one for one in differences if one.name == name], names[reference]) for name in names]
+    return {
+        **shown,
+        "conditions": conditions(judgements),
+        "sentences": [told for told in found if told],
+        "reference": controller_cell(reference + 1, names[reference]),
+        "paired": comparison_plots.paired(compared),
+        "responses": comparison_plots.responses([one.flights for one in evaluations], compared),
+        "boxes": comparison_plots.boxes(compared),
+        "differences": differences_table(judgements, reference, differences),
+    }

@@ -1,13 +1,13 @@
 """What a reproduction shows: the verdicts in a terminal, as Markdown and as a page, from the same tables."""
 
+import dataclasses
 import itertools
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from typing import Any, get_args
 
-from markupsafe import Markup
-
-from flytune.report import page, tables
+from flytune.evaluation.comparison_table import comparison_table
+from flytune.report import page
 from flytune.reproduction.evidence import SEED, SETTINGS, TRIALS, WEIGHTS_FILES, Evidence
 from flytune.reproduction.figures import FIGURES
 from flytune.reproduction.inconsistencies import Inconsistency
@@ -68,7 +68,7 @@ def html(
 ) -> str:
     """The page of a reproduction, which carries its figures (SVG by name)."""
     flown = [
-        ("seeds", f"{behaviour} seed {seed}, {weights}", judgement)
+        dataclasses.replace(judgement, name=f"{behaviour} seed {seed}, {weights}")
         for behaviour in BEHAVIOURS
         for weights in WEIGHTS_FILES
         for seed, judgement in enumerate(evidence.response(behaviour, weights).judgements)
@@ -91,7 +91,7 @@ def html(
             for claim in claims
         ],
         "inconsistencies": [(each, measure_table(each.measures)) for each in inconsistencies],
-        "seeds": Markup(tables.comparison_table(flown)),
+        "seeds": comparison_table(flown),
     }
     return page.render("reproduction.html", **values)
 

@@ -1,0 +1,143 @@
+"""Figures of where flights were: how much of each bound they left, and their paths in space."""
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import plotly.graph_objects as go
+from jaxtyping import Float
+from plotly.subplots import make_subplots
+
+from flytune.evaluation.flights import Flights
+from flytune.evaluation.judge import Judgement
+from flytune.report import style
+from flytune.report.plots import TRIALS_SHOWN, stride
+from flytune.report.style import heading, label
+
+TRIALS_BEHIND = 100  # more lines than these only blacken the picture in 3-D
+
+
+def margins(flights: Flights, judgement: Judgement) -> go.Figure | str:
+    """Share of each termination's bound that is left over time: median, p5 to p95 and extremes over the trials."""
+    if not flights.margins:
+        return "The task has no termination condition, so there is no margin to draw."
+    names = sorted(flights.margins, key=lambda name: _tightness(flights.margins[name]))
+    columns, rows = min(3, len(names)), math.ceil(len(names) / 3)
+    titles = [
+        f"{heading(label(name, 26))}<br>crossed in {np.count_nonzero(judgement.violated[name])} of {flights.trials}"
+        for name in names
+    ]
+    figure = make_subplots(
+        rows, columns, shared_xaxes=True, vertical_spacing=0.32 / rows, horizontal_spacing=0.07, subplot_titles=titles
+    )
+    drawn = []
+    for index, name in enumerate(names):
+        row, column = divmod(index, columns)
+        drawn.append(_draw_margin(figure, flights, flights.margins[name], row + 1, column + 1, legend=index == 0))
+    figure.update_xaxes(range=[0, flights.duration], hoverformat=".2f", showticklabels=True)
+    for column in range(columns):
+        last = max(range(column, len(names), columns)) // columns + 1
+        figure.update_xaxes(title_text="time [s]", row=last, col=column + 1)
+    lowest = min(float(np.nanmin(levels, initial=0.0)) for levels in drawn)
+    figure.update_yaxes(range=[max(lowest, -100.0) - 5, 100])  # a bound on altitude may leave more than all of itself
+    figure.update_yaxes(title_text="margin [% of bound]", col=1)
+    return style.frame(figure, 110 + 240 * rows, hovermode="x", margin={"l": 66, "r": 14, "t": 86, "b": 48})
+
+
+def _tightness(margin: Float[np.ndarray, "N K"]) -> float:
+    """What the median trial left of a bound at its worst instant: the smaller, the more the bound holds back."""
+    return float(np.median(np.where(np.isfinite(margin), margin, -np.inf).min(axis=1)))
+
+
+def _draw_margin(
+    figure: go.Figure, flights: Flights, margin: Float[np.ndarray, "N K"], row: int, column: int, legend: bool
+) -> list[Float[np.ndarray, "K"]]:
+    """Draw a panel; what comes back are its curves, from the smallest to the largest margin."""
+    step = 2 * stride(flights)
+    levels = _percentiles(100.0 * margin[:, ::step], (0, 5, 50, 95, 100))
+    common: dict[str, Any] = {"x0": 0, "dx": step * float(flights.time[1]), "mode": "lines", "showlegend": False}
+    edge = {"width": 0, "color": style.AXES["x"]}
+    for low, high, opacity, name in ((0, 4, 0.13, "smallest to largest"), (1, 3, 0.22, "p5 to p95")):
+        figure.add_trace(go.Scatter(**common, y=levels[low], line=edge, hoverinfo="skip"), row=row, col=column)
+        band = go.Scatter(
+            **{**common, "showlegend": legend},
+            y=levels[high],
+            line=edge,
+            fill="tonexty",
+            fillcolor=f"rgba(11, 95, 165, {opacity})",
+            name=name,
+            hoverinfo="skip",
+        )
+        figure.add_trace(band, row=row, col=column)
+    line = {"color": style.AXES["x"], "width": 1.5}
+    median = go.Scatter(
+        **{**common, "showlegend": legend}, y=levels[2], line=line, name="median", hovertemplate="%{y:.0f} %"
+    )
+    figure.add_trace(median, row=row, col=column)
+    place: dict[str, Any] = {"row": row, "col": column}
+    figure.add_hline(0, line={"color": style.BOUND, "width": 1}, **place)
+    return levels
+
+
+def _percentiles(values: Float[np.ndarray, "N K"], levels: tuple[int, ...]) -> list[Float[np.ndarray, "K"]]:
+    """Percentiles over the trials; a margin that is not finite belongs to a lost trial and counts as the worst."""
+    counted = np.sort(np.where(np.isfinite(values), values, -np.inf), axis=0)
+    chosen = [counted[max(math.ceil(level / 100 * len(counted)) - 1, 0)] for level in levels]
+    return [np.where(np.isfinite(level), level, np.nan).astype(np.float32) for level in chosen]
+
+
+def flights_3d(flights: Flights) -> go.Figure:
+    """The trajectories in space: the first trials in colour with their starts, the others in grey, the target."""
+    figure = go.Figure()
+    step = 2 * stride(flights)
+    shown = min(TRIALS_SHOWN, flights.trials)
+    behind = flights.position[shown : shown + TRIALS_BEHIND, :: 2 * step]
+    if len(behind):
+        gaps = np.full((len(behind), 1, 3), np.nan)  # so that one trace holds many separate lines
+        points = np.concatenate([behind, gaps], axis=1).reshape(-1, 3)
+        figure.add_trace(_path(points, style.OTHERS, 2.0, f"{len(behind)} more trials"))
+    for trial in range(shown):
+        path = flights.position[trial, ::step]
+        figure.add_trace(_path(path, style.TRIALS[trial], 4.0, f"trial {trial + 1}", group=str(trial)))
+        figure.add_trace(_mark(path[0], style.TRIALS[trial], "circle", f"start of trial {trial + 1}", str(trial)))
+    figure.add_trace(_mark(flights.target_position, style.BOUND, "diamond", "target", "target", legend=True))
+    axis = {"gridcolor": style.HAIRLINE, "zeroline": False, "showbackground": False, "linecolor": style.QUIET}
+    scene: Mapping[str, Any] = {
+        **{f"{name}axis": {**axis, "title": {"text": f"{name} [m]"}} for name in "xyz"},
+        "aspectmode": "data",
+        "camera": {"eye": {"x": 1.2, "y": -1.4, "z": 0.72}, "center": {"x": 0, "y": 0, "z": -0.24}},
+    }
+    return style.frame(figure, 560, scene=scene, margin={"l": 0, "r": 0, "t": 40, "b": 0})
+
+
+def _path(points: Float[np.ndarray, "M 3"], colour: str, width: float, name: str, group: str = "") -> go.Scatter3d:
+    x, y, z = points.T.astype(np.float32)
+    return go.Scatter3d(
+        x=x,
+        y=y,
+        z=z,
+        mode="lines",
+        line={"color": colour, "width": width},
+        name=name,
+        legendgroup=group,
+        hovertemplate="%{x:.2f}, %{y:.2f}, %{z:.2f} m" if group else None,
+        hoverinfo=None if group else "skip",
+    )
+
+
+def _mark(
+    point: Float[np.ndarray, "3"], colour: str, symbol: str, name: str, group: str, legend: bool = False
+) -> go.Scatter3d:
+    x, y, z = ([float(value)] for value in point)
+    return go.Scatter3d(
+        x=x,
+        y=y,
+        z=z,
+        mode="markers",
+        marker={"color": colour, "size": 5, "symbol": symbol},
+        name=name,
+        legendgroup=group,
+        showlegend=legend,
+        hovertemplate="%{x:.2f}, %{y:.2f}, %{z:.2f} m",
+    )

@@ -1,0 +1,66 @@
+"""What a page says of flights and tasks beside its tables and figures, as plain values that the templates write."""
+
+import re
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from flytune.config import document, nested
+from flytune.evaluation.judge import AXES, Judgement
+from flytune.report.style import listed
+from flytune.tables import NULL, Column, Table, number
+from flytune.task.task import Task, write_task
+
+COMMENT = re.compile(r"""^((?:"(?:\\.|[^"\\])*"|'[^']*'|[^"'#])*)(#.*)$""")  # a # inside quotes begins no comment
+
+
+def summary(judgement: Judgement) -> dict[str, Any]:
+    """The flights in one sentence, as its parts: trials that settle on all axes, and the slowest axis or those that fail."""
+    settled = np.logical_and.reduce([np.isfinite(judgement.settling_time[axis]) for axis in AXES])
+    judged = judgement.to_dict()["axes"]
+    medians = {axis: judged[axis]["settling_time"]["median"] for axis in AXES}
+    late = [axis for axis in AXES if medians[axis] is None]
+    slowest = max((axis for axis in AXES if axis not in late), key=lambda axis: medians[axis], default="")
+    return {
+        "settled": np.count_nonzero(settled),
+        "late": listed(late),
+        "slowest": slowest,
+        "median": number(medians.get(slowest), 2),
+    }
+
+
+def facts(judgement: Judgement, speed_bound: float | None) -> dict[str, str]:
+    """What does not belong to one axis, as terms and their meaning: failures, bounds, speed, action."""
+    judged = judgement.to_dict()
+    crossed = [f"{name} {count}" for name, count in judged["violations"].items()]
+    peak, action = judged["peak_speed"], judged["action"]
+    bound = "no bound" if speed_bound is None else f"bound {speed_bound:g} m/s"
+    small = ", ".join(f"{axis} {judged['axes'][axis]['small_steps']}" for axis in AXES)
+    return {
+        "crashed": f"{judged['crashed']} of {judgement.trials} trials",
+        "infeasible": f"{judged['infeasible']} of {judgement.trials} trials (no controller could settle these in time)",
+        "trials that crossed a bound": ", ".join(crossed) or "none, the task has no bound",
+        "peak speed": f"{number(peak['median'], 2)} m/s median, {number(peak['p95'], 2)} m/s p95 ({bound})",
+        "efficiency": f"{number(judged['efficiency']['median'], 2)} median (physical bound / settling time)",
+        "action": f"{number(action['rms'], 3)} RMS, changes by {number(action['total_variation'], 4)} per step",
+        "step too small for overshoot": f"{small} trials",
+        "flown": f"{judgement.trials} trials of {judgement.duration:g} s, starts {judgement.initial_conditions}, "
+        f"seed {judgement.seed}, vehicle {judgement.vehicle}, world {judgement.simulator}",
+    }
+
+
+def task_differences(tasks: Sequence[tuple[str, Task]]) -> Table | None:
+    """The fields in which the tasks of several controllers differ, one column per controller; None where none does."""
+    plain = [document.plain(task) for _, task in tasks]
+    flat = [{path: str(value) for path, value in nested.leaves(task, skip=["sources"])} for task in plain]
+    paths = dict.fromkeys(path for leaves in flat for path in leaves)
+    differing = [path for path in paths if len({leaves.get(path) for leaves in flat}) > 1]
+    rows = [(path, *(leaves.get(path, NULL) for leaves in flat)) for path in differing]
+    return Table.plain(["field", *(Column(name) for name, _ in tasks)], rows) if rows else None
+
+
+def task_lines(task: Task) -> list[tuple[str, str]]:
+    """The lines of the task file, each as its value and its comment (units, allowed ranges, sources)."""
+    found = [(COMMENT.match(line), line) for line in write_task(task).splitlines()]
+    return [(match[1], match[2]) if match else (line, "") for match, line in found]
