@@ -1,5 +1,7 @@
 """Pages as a browser reads them, and the worst that a name can be."""
 
+import base64
+import gzip
 import json
 from html.parser import HTMLParser
 
@@ -16,14 +18,14 @@ class Reader(HTMLParser):
 
     def handle_starttag(self, tag, attrs):
         self.elements.append((tag, dict(attrs)))
-        self._data = dict(attrs).get("type") == "application/json"
+        self._data = dict(attrs).get("type") == "application/gzip" and "id" not in dict(attrs)
 
     def handle_endtag(self, tag):
         self._data = False
 
     def handle_data(self, data):
         if self._data:
-            self.figures.append(json.loads(data))
+            self.figures.append(json.loads(gzip.decompress(base64.b64decode(data))))
         elif self.elements and self.elements[-1][0] not in ("script", "style"):
             self.text += data
 

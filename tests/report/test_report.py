@@ -92,7 +92,7 @@ def test_the_page_holds_the_task_with_every_number(read, make_evaluation, task):
 
 def test_the_page_of_one_controller_has_a_figure_of_each_kind(read, make_evaluation):
     kinds = [{trace["type"] for trace in figure["data"]} for figure in read(make_evaluation()).figures]
-    assert kinds == [{"scatter"}, {"box"}, {"scatter"}, {"scatter3d"}, {"scatter"}]
+    assert kinds == [{"scatter"}, {"scatter"}, {"box"}, {"scatter"}, {"scatter3d"}, {"scatter"}]
 
 
 def test_the_page_loads_nothing_from_the_network(read, make_evaluation):
@@ -124,11 +124,24 @@ def test_names_that_are_markup_come_out_as_text(read, hostile_evaluation):
     assert html.escape("<script>") in page.texts_of_figures()
 
 
-def test_no_text_of_a_figure_can_end_its_script_element(read, hostile_evaluation, tmp_path):
-    read(hostile_evaluation)
-    page = (tmp_path / "report.html").read_text()
-    begin = page.index('<script type="application/json">') + len('<script type="application/json">')
-    assert not set("<>&") & set(page[begin : page.index("</script>", begin)])
+def test_the_page_of_one_controller_is_smaller_than_its_limit(read, make_evaluation, flights, tmp_path):
+    # the packed plotly.js and the figures of 100 trials of 10 s, a training curve among them
+    copies, long = -(-100 // flights.trials), -(-1001 // flights.time.size)
+
+    def enlarge(values):
+        noise = 1e-3 * np.random.default_rng(0).normal(size=(100, 1001, *values.shape[2:]))
+        return np.tile(values, (copies, long, *[1] * (values.ndim - 2)))[:100, :1001] + noise
+
+    names = ("position", "attitude", "velocity", "body_rate", "rotor_speed_rpm", "action")
+    read(
+        make_evaluation(
+            time=np.arange(1001) / 100,
+            crashed=np.zeros(100, dtype=bool),
+            margins={name: enlarge(margin) for name, margin in flights.margins.items()},
+            **{name: enlarge(getattr(flights, name)) for name in names},
+        )
+    )
+    assert (tmp_path / "report.html").stat().st_size < 2.5e6
 
 
 @pytest.mark.parametrize("odd", SENTENCES)
@@ -144,7 +157,14 @@ def test_several_controllers_are_compared_on_top_and_their_differing_numbers_lis
     assert "2 controllers compared" in page.text
     assert page.text.index("two") < page.text.index("How their tasks differ") < page.text.index("on all four axes")
     assert "horizon500700" in page.text
-    assert len(page.figures) == 1 + 2 * 5
+    assert len(page.figures) == 4 + 2 * 6
+
+
+def test_controllers_of_other_trials_stand_side_by_side_without_paired_differences(read, make_evaluation):
+    page = read(make_evaluation(name="one"), make_evaluation(name="two", seed=2))
+    assert "There are no paired differences" in page.text
+    assert "seed: 0 for one and 2 for two" in page.text or "seed: 1 for one and 2 for two" in page.text
+    assert len(page.figures) == 1 + 2 * 6
 
 
 def test_controllers_of_the_same_task_are_said_to_share_it(read, make_evaluation):
@@ -223,22 +243,22 @@ def look_at(browser, path):
 @pytest.mark.browser
 def test_a_browser_draws_every_figure_without_an_error_or_a_request(browser, make_evaluation, tmp_path):
     write_report(tmp_path / "report.html", [make_evaluation(name="one"), make_evaluation(name="two")])
-    assert look_at(browser, tmp_path / "report.html") == 11
+    assert look_at(browser, tmp_path / "report.html") == 4 + 2 * 6
 
 
 @pytest.mark.browser
 def test_a_browser_draws_the_odd_cases_too(browser, odd_evaluations, tmp_path):
     evaluations = [dataclasses.replace(evaluation, name=odd) for odd, evaluation in odd_evaluations.items()]
     write_report(tmp_path / "report.html", evaluations)
-    # the comparison, and five of each but for three without a curve, two without boxes, one without margins
-    assert look_at(browser, tmp_path / "report.html") == 1 + 5 * len(evaluations) - 6
+    # the shares, and six of each but for three without a curve, two without boxes, one without margins
+    assert look_at(browser, tmp_path / "report.html") == 1 + 6 * len(evaluations) - 6
 
 
 @pytest.mark.browser
 def test_a_browser_shows_hostile_names_as_text(browser, hostile_evaluation, tmp_path):
     write_report(tmp_path / "report.html", [hostile_evaluation, hostile_evaluation])
     look_at(browser, tmp_path / "report.html")
-    assert browser.evaluate("document.querySelector('h2').textContent") == HOSTILE
+    assert browser.evaluate("document.querySelector('h2').textContent").startswith(HOSTILE)
     assert browser.evaluate("document.querySelector('.legendtext').textContent").startswith("<script>alert(1)</script>")
 
 

@@ -40,7 +40,7 @@ def margins(flights: Flights, judgement: Judgement) -> go.Figure | str:
         last = max(range(column, len(names), columns)) // columns + 1
         figure.update_xaxes(title_text="time [s]", row=last, col=column + 1)
     lowest = min(float(np.nanmin(levels, initial=0.0)) for levels in drawn)
-    figure.update_yaxes(range=[max(lowest, -100.0) - 5, 100])  # a bound on altitude may leave more than all of itself
+    figure.update_yaxes(range=[max(lowest, -100.0) - 5, 102])
     figure.update_yaxes(title_text="margin [% of bound]", col=1)
     return style.frame(figure, 110 + 240 * rows, hovermode="x", margin={"l": 66, "r": 14, "t": 86, "b": 48})
 
@@ -55,7 +55,7 @@ def _draw_margin(
 ) -> list[Float[np.ndarray, "K"]]:
     """Draw a panel; what comes back are its curves, from the smallest to the largest margin."""
     step = 2 * stride(flights)
-    levels = _percentiles(100.0 * margin[:, ::step], (0, 5, 50, 95, 100))
+    levels = _percentiles(100.0 * np.minimum(margin[:, ::step], 1.0), (0, 5, 50, 95, 100))  # altitudes may have more
     common: dict[str, Any] = {"x0": 0, "dx": step * float(flights.time[1]), "mode": "lines", "showlegend": False}
     edge = {"width": 0, "color": style.AXES["x"]}
     for low, high, opacity, name in ((0, 4, 0.13, "smallest to largest"), (1, 3, 0.22, "p5 to p95")):
@@ -92,7 +92,7 @@ def flights_3d(flights: Flights) -> go.Figure:
     figure = go.Figure()
     step = 2 * stride(flights)
     shown = min(TRIALS_SHOWN, flights.trials)
-    behind = flights.position[shown : shown + TRIALS_BEHIND, :: 2 * step]
+    behind = flights.position[shown : shown + TRIALS_BEHIND, :: 4 * step]
     if len(behind):
         gaps = np.full((len(behind), 1, 3), np.nan)  # so that one trace holds many separate lines
         points = np.concatenate([behind, gaps], axis=1).reshape(-1, 3)

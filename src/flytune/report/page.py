@@ -57,7 +57,7 @@ def _environment() -> jinja2.Environment:
         lstrip_blocks=True,
     )
     environment.globals.update(asset=_asset, plotly=_plotly)
-    environment.filters["data"] = _data
+    environment.filters["packed"] = lambda plot: pack(plot.to_json(validate=False))
     environment.filters["base64"] = lambda text: base64.b64encode(text.encode()).decode()
     environment.tests["in_space"] = lambda plot: any(trace.type == "scatter3d" for trace in plot.data)
     return environment
@@ -71,14 +71,13 @@ def _asset(name: str) -> Markup:
 
 @functools.cache
 def _plotly() -> str:
-    """plotly.js, compressed to two fifths, which `page.js` unpacks; base64 needs no escaping."""
-    return base64.b64encode(gzip.compress(get_plotlyjs().encode(), mtime=0)).decode()
+    """plotly.js, packed."""
+    return pack(get_plotlyjs())
 
 
-def _data(plot: go.Figure) -> Markup:
-    """The figure as JSON in which no text can end the script element, or begin a comment or another script."""
-    text = plot.to_json(validate=False) or ""
-    return Markup(text.replace("&", "\\u0026").replace("<", "\\u003c").replace(">", "\\u003e"))
+def pack(text: str) -> str:
+    """A text compressed, in letters that need no escaping in HTML; `page.js` unpacks it."""
+    return base64.b64encode(gzip.compress(text.encode(), mtime=0)).decode()
 
 
 def page(title: str, body: str) -> str:

@@ -1,13 +1,16 @@
-// plotly.js travels compressed; it is unpacked in the browser and run as a script of this page.
-const unpack = async packed => {
-  const bytes = Uint8Array.from(atob(packed), letter => letter.charCodeAt(0));
+// plotly.js and the figures travel compressed; they are unpacked here, in the browser.
+const unpack = async script => {
+  const bytes = Uint8Array.from(atob(script.textContent), letter => letter.charCodeAt(0));
   const stream = new Blob([bytes]).stream().pipeThrough(new DecompressionStream("gzip"));
   return new Response(stream).text();
 };
+const plots = document.querySelectorAll(".figure > div");
+const figures = new Map();
 const load = async () => {
   const script = document.createElement("script");
-  script.textContent = await unpack(document.getElementById("plotly").textContent);
+  script.textContent = await unpack(document.getElementById("plotly"));
   document.head.append(script);
+  await Promise.all([...plots].map(async plot => figures.set(plot, await unpack(plot.nextElementSibling))));
 };
 
 const config = {
@@ -15,11 +18,10 @@ const config = {
   showSendToCloud: false,  // plotly.js offers an upload of the figure to its maker's server
   modeBarButtonsToRemove: ["select2d", "lasso2d", "autoScale2d", "resetCameraLastSave3d"],
 };
-const plots = document.querySelectorAll(".figure > div");
 const draw = plot => {
   if (plot.dataset.drawn) return;
   plot.dataset.drawn = "yes";
-  const figure = JSON.parse(plot.parentElement.querySelector("script").textContent);
+  const figure = JSON.parse(figures.get(plot));
   Plotly.newPlot(plot, figure.data, figure.layout, config);
 };
 const clear = plot => {
