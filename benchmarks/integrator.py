@@ -22,6 +22,7 @@ from scipy.integrate import solve_ivp
 from flytune.physics import dynamics, rotation
 from flytune.physics.components import Components, add, scale, unpack
 from flytune.physics.dynamics import CONTROL_PERIOD, State
+from flytune.physics.rotors import thrust_and_torque
 from flytune.physics.vehicle import Vehicle, load_vehicle
 
 STEPS = 200  # control periods, 2 s
@@ -100,7 +101,7 @@ def classical(vehicle: Vehicle, state: State, action: jax.Array, physics_steps: 
 def rates_of_scalars(vehicle: Vehicle, body: tuple[Components, ...], rotors: Components) -> tuple[Components, ...]:
     """The derivatives of position, attitude, velocity and body rate, on tuples of scalars."""
     _, q, v, w = body
-    thrust, torque = dynamics.thrust_and_torque(vehicle, rotors)
+    thrust, torque = thrust_and_torque(vehicle, rotors)
     drag = tuple(-d / vehicle.mass * s for d, s in zip(vehicle.drag, v, strict=True))
     pull = add(scale(thrust / vehicle.mass, rotation.vertical_axis(q)), drag, (0.0, 0.0, -vehicle.gravity))
     return v, scale(0.5, rotation.multiply(q, (*w, 0.0))), pull, dynamics.angular_acceleration(vehicle, w, torque)

@@ -28,8 +28,9 @@ from flytune.evaluation.statistics import bootstrap_interval, median
 from flytune.physics import rotation
 from flytune.physics.components import pack, unpack
 from flytune.physics.dynamics import CONTROL_PERIOD
+from flytune.physics.rotors import places, spins
 from flytune.physics.vehicle import Vehicle, load_vehicle
-from flytune.simulation.actuator import SIDE, SPIN, Actuator
+from flytune.simulation.actuator import Actuator
 from flytune.simulation.aerodynamics import ground_effect, rotor_drag
 from flytune.simulation.simulator import VehicleStates, to_inertial
 from flytune.simulation.simulators import make_simulator
@@ -61,9 +62,9 @@ def equations(
             thrust = thrust * (1 + ground_effect(vehicle, y[None, :3], q[None])[0])
         torque = np.array(
             [
-                vehicle.lever * thrust @ SIDE[:, 1],
-                -vehicle.lever * thrust @ SIDE[:, 0],
-                vehicle.torque_coefficient * rpm**2 @ SPIN,
+                thrust @ places(vehicle)[:, 1],
+                -thrust @ places(vehicle)[:, 0],
+                vehicle.torque_coefficient * rpm**2 @ np.array(spins(vehicle)),
             ]
         )
         pull = to_inertial(q[None], np.array([[0, 0, thrust.sum()]]))[0] - drag * v

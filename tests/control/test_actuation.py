@@ -1,15 +1,20 @@
 """Actuation: mixing, allocating and hurrying the motors give back what was asked for (paper R4, R9)."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.optimize import linprog
+from tests.layouts import LAYOUTS, with_layout
 
-from flytune.control.actuation import action_for, allocate, estimated_rotor_speed, hovering_rotors, mixed
-from flytune.physics.dynamics import CONTROL_PERIOD, commanded_rotor_speed, rotor_speed_after, thrust_and_torque
-from flytune.physics.vehicle import load_vehicle, vehicle_names
+from flytune.control.actuation import action_for, allocate, estimated_rotor_speed, hovering_rotors
+from flytune.physics.dynamics import CONTROL_PERIOD, commanded_rotor_speed, rotor_speed_after
+from flytune.physics.rotors import mixed, places, spins, thrust_and_torque
+from flytune.physics.vehicle import Rotors, load_vehicle, vehicle_names
 
 VEHICLES = {name: load_vehicle(name) for name in vehicle_names()}
 actions = st.lists(st.floats(-1, 1, width=32), min_size=4, max_size=4)
@@ -99,6 +104,70 @@ def test_mixing_squares_is_the_mixer_of_the_physics():
     wanted_thrust, wanted_torque = thrust_and_torque(vehicle, speeds)
     np.testing.assert_allclose(thrust, wanted_thrust, rtol=1e-6)
     np.testing.assert_allclose(torque, wanted_torque, rtol=1e-5)
+
+
+# --- other layouts of rotors ---
+
+
+@pytest.mark.parametrize("name", LAYOUTS)
+@settings(max_examples=50, deadline=None)
+@given(action=actions)
+def test_allocating_what_the_rotors_of_any_layout_give_gives_back_the_rotors(name, action):
+    speeds, back = there_and_back(with_layout(name), tuple(map(jnp.float32, action)))
+    np.testing.assert_allclose(np.stack(back), np.stack(speeds), rtol=4e-6)
+
+
+def asked(vehicle, number):
+    """Thrusts and torques, within reach and far beyond."""
+    draw = np.random.default_rng(0)
+    weight = vehicle.mass * vehicle.gravity
+    arms = np.array([0.03, 0.03, vehicle.torque_coefficient / vehicle.thrust_coefficient])
+    size = draw.choice([0.1, 0.5, 2.0], (number, 1))
+    return weight * draw.uniform(-0.5, 3, number), weight * arms * size * draw.normal(size=(number, 3))
+
+
+def test_the_general_allocation_is_that_of_the_x_configuration_for_its_places():
+    vehicle = VEHICLES["crazyflie"]
+    layout = Rotors(place=tuple(map(tuple, places(vehicle).tolist())), spin=spins(vehicle))
+    other = dataclasses.replace(vehicle, arm=None, rotors=layout)
+    thrust, torque = (jnp.float32(part) for part in asked(vehicle, 200))
+    one, two = (
+        jax.vmap(lambda f, t, v=v: jnp.stack(allocate(v, f, (t[0], t[1], t[2]))))(thrust, torque)
+        for v in (vehicle, other)
+    )
+    np.testing.assert_allclose(one, two, rtol=1e-5)
+
+
+@pytest.mark.parametrize("name", LAYOUTS)
+def test_yaw_gives_way_first_then_thrust_then_roll_and_pitch(name):
+    # the same order of priorities by three linear programmes, on the squares of rotor speeds
+    vehicle = with_layout(name)
+    place, spin = np.array(LAYOUTS[name].place), np.array(LAYOUTS[name].spin)
+    kf, km = vehicle.thrust_coefficient, vehicle.torque_coefficient
+    columns = np.linalg.inv(np.stack([np.full(4, kf), kf * place[:, 1], -kf * place[:, 0], km * spin]))
+    hover = vehicle.hover_rotor_speed_rpm
+    limits = (hover / 2) ** 2, min(1.5 * hover, vehicle.maximum_rotor_speed_rpm) ** 2
+    for thrust, torque in zip(*asked(vehicle, 30), strict=True):
+        wanted = 1.0, thrust, torque[2]
+        terms = np.c_[columns[:, 1:3] @ torque[:2], columns[:, 0], columns[:, 3]]  # of share, thrust, yaw torque
+        scale = np.array([1.0, vehicle.mass * 9.81, vehicle.mass * 9.81 * km / kf])
+        rows = np.r_[terms, -terms] * scale / hover**2
+        ends = np.r_[np.full(4, limits[1]), np.full(4, -limits[0])] / hover**2
+        found = []
+        for index in range(3):
+            reached = [
+                linprog(
+                    sign * np.eye(3)[index], rows, ends, bounds=[(x, x) for x in found] + [(None, None)] * (3 - index)
+                )
+                for sign in (1, -1)
+            ]
+            low, high = (
+                each.x[index] if each.status == 0 else bound for each, bound in zip(reached, (-1e9, 1e9), strict=True)
+            )
+            found.append(float(np.clip(wanted[index] / scale[index], max(low, 0.0 if index == 0 else low), high)))
+        squares = terms * scale @ found
+        speeds = allocate(vehicle, jnp.float32(thrust), tuple(map(jnp.float32, torque)))
+        np.testing.assert_allclose(np.stack(speeds), np.sqrt(squares), rtol=2e-4)
 
 
 # --- motors ---

@@ -5,11 +5,15 @@ import dataclasses
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from tests.layouts import LAYOUTS, with_layout
 
+import flytune
+from flytune.control.classical import CLASSICAL, classical_controller
 from flytune.physics.dynamics import CONTROL_PERIOD
 from flytune.physics.vehicle import load_vehicle
 from flytune.simulation.simulator import VehicleStates, to_body, to_inertial
 from flytune.simulation.simulators import make_simulator
+from flytune.task.task import load_task
 
 SIMULATORS = ("pybullet", "mujoco")
 STATE = ("position", "attitude", "velocity", "body_rate")
@@ -171,6 +175,39 @@ def test_each_motor_lifts_and_turns_as_the_paper_says(name, paper, motor):
     np.testing.assert_allclose(level.body_rate[0], torque / paper.inertia * CONTROL_PERIOD, rtol=1e-2)
     np.testing.assert_allclose(leaning.body_rate, level.body_rate, rtol=1e-9)
     assert level.velocity[0, 2] == pytest.approx(more / paper.mass * CONTROL_PERIOD, rel=1e-3)
+
+
+@pytest.fixture(params=("flytune", *SIMULATORS))
+def anywhere(request):
+    """The name of each simulator, flytune's own among them."""
+    if request.param != "flytune":
+        pytest.importorskip(request.param, reason=f"needs flytune[{request.param}]")
+    return request.param
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_a_vehicle_with_its_rotors_elsewhere_hovers_and_turns_the_right_way(anywhere, layout):
+    vehicle = with_layout(layout)
+    assert difference(fly(anywhere, vehicle, body(vehicle), [np.zeros((1, 4))] * 50), body(vehicle)).max() < 1e-5
+    more = 0.21 * vehicle.mass * vehicle.gravity / 4
+    for motor, ((x, y), spin) in enumerate(zip(LAYOUTS[layout].place, LAYOUTS[layout].spin, strict=True)):
+        action = np.zeros((1, 4))
+        action[0, motor] = 0.2
+        torque = np.array([y, -x, spin * vehicle.torque_coefficient / vehicle.thrust_coefficient]) * more
+        rate = fly(anywhere, vehicle, body(vehicle), [action]).body_rate[0]
+        expected = torque / vehicle.inertia * CONTROL_PERIOD
+        # it has hardly begun to turn: what the turning rotors and axes do to each other is left out
+        np.testing.assert_allclose(rate, expected, rtol=2e-2, atol=1e-2 * np.abs(expected).max())
+
+
+@pytest.mark.parametrize("controller", CLASSICAL)
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_a_classical_controller_brings_a_vehicle_with_its_rotors_elsewhere_to_the_target(layout, controller):
+    task = load_task("baseline")
+    task = dataclasses.replace(task, vehicle=with_layout(layout), noise=dataclasses.replace(task.noise, position=0.0))
+    flights = flytune.fly(classical_controller(controller, task), task, trials=4, seed=1)
+    error = np.linalg.norm(flights.position[:, -1] - np.array(task.target.position), axis=-1)
+    assert not flights.crashed.any() and error.max() < 0.05
 
 
 @pytest.mark.parametrize("vehicle", ["paper", "measured"])

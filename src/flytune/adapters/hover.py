@@ -9,6 +9,7 @@ from flytune.adapters.single import parts
 from flytune.errors import BadInput
 from flytune.extras import require
 from flytune.physics.dynamics import CONTROL_PERIOD
+from flytune.physics.rotors import places
 from flytune.task.observation import SIZE
 from flytune.task.task import Task, load_task
 
@@ -136,7 +137,7 @@ def take_picture(task: Task, body: np.ndarray, trail: np.ndarray, steps: int, re
         position=part["position"],
         attitude=part["attitude"],
         thrust=(part["rotor_speed_rpm"] / task.vehicle.hover_rotor_speed_rpm) ** 2,
-        arm=float(task.vehicle.arm),
+        rotors=places(task.vehicle),
         propeller_radius=float(task.vehicle.propeller_radius),
         target=target,
         target_yaw=float(task.target.yaw),

@@ -32,13 +32,18 @@ class Scene:
     position: Float[np.ndarray, "3"]  # m
     attitude: Float[np.ndarray, "4"]  # unit quaternion (x, y, z, w), body to inertial
     thrust: Float[np.ndarray, "4"]  # of each motor, over its share of the weight
-    arm: float  # m, from the centre to each motor
+    rotors: Float[np.ndarray, "4 2"]  # m, where they stand in the body frame
     propeller_radius: float  # m
     target: Float[np.ndarray, "3"]  # m
     target_yaw: float  # rad
     band: float  # m, radius of the sphere around the target that counts as settled
     trail: Float[np.ndarray, "steps 3"]  # m, where the vehicle has been, oldest first
     lines: tuple[tuple[str, str], ...]  # what is written: name and value
+
+    @property
+    def reach(self) -> float:
+        """Distance of the farthest rotor from the centre in m."""
+        return float(np.linalg.norm(self.rotors, axis=1).max())
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -140,7 +145,7 @@ def _fading_line(pen: Any, camera: Camera, line: Float[np.ndarray, "n 3"], opaci
 
 def _shadow(pen: Any, camera: Camera, scene: Scene) -> None:
     """Where vehicle and target stand over the ground, and how high."""
-    for place, colour, radius in ((scene.position, (0, 0, 0), 1.6 * scene.arm), (scene.target, TARGET, scene.arm)):
+    for place, colour, radius in ((scene.position, (0, 0, 0), 1.6 * scene.reach), (scene.target, TARGET, scene.reach)):
         below = np.array([place[0], place[1], 0.0])
         ring = below + _circle(radius, np.eye(3))
         _polygon(pen, camera, ring, (*colour, 90))
@@ -174,7 +179,7 @@ def _target(pen: Any, camera: Camera, scene: Scene) -> None:
 def _enlargement(camera: Camera, scene: Scene) -> float:
     """How many times larger than life the vehicle is drawn: 1 where it can be seen well as it is."""
     depth = max(float(camera.project(scene.position)[1]), NEAREST)
-    width = camera.focal_length * 2 * (scene.arm + scene.propeller_radius) / depth
+    width = camera.focal_length * 2 * (scene.reach + scene.propeller_radius) / depth
     return max(1.0, SMALLEST_VEHICLE * SIZE * FINER / width)
 
 
@@ -183,15 +188,14 @@ def _vehicle(pen: Any, camera: Camera, scene: Scene, scale: float) -> None:
     if camera.project(scene.position)[1] < NEAREST:
         return
     axes = _matrix(scene.attitude)  # columns: the body's axes in the inertial frame
-    lever = scale * scene.arm / math.sqrt(2)
-    hubs = scene.position + np.array([[1, -1, 0], [-1, -1, 0], [-1, 1, 0], [1, 1, 0]]) * lever @ axes.T
-    lift = 0.12 * scale * scene.arm * axes[:, 2]
+    hubs = scene.position + scale * scene.rotors @ axes[:, :2].T
+    lift = 0.12 * scale * scene.reach * axes[:, 2]
     for motor, hub in enumerate(hubs):
-        colour = FRONT if motor in (0, 3) else FRAME
+        colour = FRONT if scene.rotors[motor, 0] > 0 else FRAME
         _line(pen, camera, np.stack([scene.position, hub]), (*colour, 255), 3.0)
         _line(pen, camera, np.stack([hub, hub + lift]), (*FRAME, 255), 2.5)
-    _polygon(pen, camera, scene.position + _circle(0.34 * scale * scene.arm, axes), (44, 50, 62, 255), FRAME)
-    nose = np.array([[0.95, 0, 0], [0.28, 0.22, 0], [0.28, -0.22, 0]]) * scale * scene.arm
+    _polygon(pen, camera, scene.position + _circle(0.34 * scale * scene.reach, axes), (44, 50, 62, 255), FRAME)
+    nose = np.array([[0.95, 0, 0], [0.28, 0.22, 0], [0.28, -0.22, 0]]) * scale * scene.reach
     _polygon(pen, camera, scene.position + nose @ axes.T, (*FRONT, 255))
     depth = camera.project(hubs)[1]
     for motor in np.argsort(-depth):  # the farther rotor first
@@ -199,7 +203,7 @@ def _vehicle(pen: Any, camera: Camera, scene: Scene, scale: float) -> None:
         colour = _mix(WEAK, HOVERING, thrust) if thrust < 1 else _mix(HOVERING, STRONG, thrust - 1)
         disc = hubs[motor] + lift + _circle(scale * scene.propeller_radius, axes)
         _polygon(pen, camera, disc, (*colour, 105), colour)
-        stalk = np.outer([0.0, 0.55 * scale * scene.arm * float(scene.thrust[motor])], axes[:, 2])
+        stalk = np.outer([0.0, 0.55 * scale * scene.reach * float(scene.thrust[motor])], axes[:, 2])
         _line(pen, camera, hubs[motor] + lift + stalk, (*colour, 255), 2.0)
 
 

@@ -28,7 +28,7 @@ def allowed(annotation: Any) -> str:
         return "one of " + ", ".join(map(str, get_args(base)))
     if is_union(base):
         options = [option for option in get_args(base) if option is not type(None)]
-        return " or ".join(dict.fromkeys(allowed(option) for option in options))
+        return " or ".join(dict.fromkeys(allowed(Annotated[option, "", *details]) for option in options))
     if dataclasses.is_dataclass(base) or get_origin(base) is dict:
         return "a table"
     if get_origin(base) is tuple:

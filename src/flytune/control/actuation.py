@@ -7,12 +7,8 @@ from jaxtyping import Array, Float
 
 from flytune.physics.components import Components, pack
 from flytune.physics.dynamics import CONTROL_PERIOD, commanded_rotor_speed, rotor_speed_after
+from flytune.physics.rotors import directions
 from flytune.physics.vehicle import Vehicle
-
-# the sign of each motor in each torque (paper R4)
-ROLL = (-1, -1, 1, 1)
-PITCH = (-1, 1, 1, -1)
-YAW = (-1, 1, -1, 1)
 
 
 def hovering_rotors(vehicle: Vehicle) -> Components:
@@ -30,32 +26,30 @@ def estimated_rotor_speed(vehicle: Vehicle, before: Components, last_action: Com
     return rotor_speed_after(vehicle, before, commanded, CONTROL_PERIOD)
 
 
-def mixed(vehicle: Vehicle, squares: Components) -> tuple[Any, Components]:
-    """Thrust in N and torque in N m of four squared rotor speeds in rpm^2, negative ones included (paper R4)."""
-    bending = vehicle.thrust_coefficient * vehicle.lever
-    factors = ((ROLL, bending), (PITCH, bending), (YAW, vehicle.torque_coefficient))
-    torque = tuple(
-        factor * sum((sign * square for sign, square in zip(signs, squares, strict=True)), start=jnp.zeros(()))
-        for signs, factor in factors
-    )
-    return vehicle.thrust_coefficient * sum(squares, start=jnp.zeros(())), torque
-
-
 def allocate(vehicle: Vehicle, thrust: Any, torque: Components) -> Components:
     """Four rotor speeds in rpm that give a thrust in N and a torque in N m, exactly where the rotors can.
 
-        rpm_i^2 = f / (4 kf) + (ROLL_i tau_x + PITCH_i tau_y) / (4 kf l) + YAW_i tau_z / (4 km)
+    Where a rotor would leave the range of the actions, yaw torque gives way first, then thrust, and roll and pitch
+    torque last, in their ratio: tilt decides whether the vehicle stays up, heading does not.
 
-    the inverse of paper R4. Where a rotor would leave the range of the actions, yaw torque gives way first, then
-    thrust, and roll and pitch torque last, in their ratio: tilt decides whether the vehicle stays up, heading does not.
-
-    With r, p, y the three torque terms and m the thrust term, rotors 0 and 2 turn at m - y -+ (r + p), rotors 1 and 3
-    at m + y -+ (r - p). So the means of the two pairs, m - y and m + y, each have an interval, once r and p are known.
-
-    Source: the equations, inverted by hand; the order of priorities is the usual one of flight stacks
+    Source: the inverse of paper R4, worked out by hand; the order of priorities is the usual one of flight stacks
     (PX4 user guide, "airmode").
     """
-    lowest, highest = (commanded_rotor_speed(vehicle, jnp.asarray(action)) ** 2 for action in (-1.0, 1.0))
+    limits = tuple(commanded_rotor_speed(vehicle, jnp.asarray(action)) ** 2 for action in (-1.0, 1.0))
+    solve = _x_squares if vehicle.rotors is None else _squares
+    return tuple(jnp.sqrt(square) for square in solve(vehicle, thrust, torque, limits))
+
+
+def _x_squares(vehicle: Vehicle, thrust: Any, torque: Components, limits: Components) -> Components:
+    """The squared rotor speeds of the x configuration in rpm^2, see `allocate`.
+
+        rpm_i^2 = f / (4 kf) + (roll_i tau_x + pitch_i tau_y) / (4 kf l) + yaw_i tau_z / (4 km)
+
+    with the signs of paper R4. With r, p, y the three torque terms and m the thrust term, rotors 0 and 2 turn at
+    m - y -+ (r + p), rotors 1 and 3 at m + y -+ (r - p). So the means of the two pairs, m - y and m + y, each have an
+    interval, once r and p are known.
+    """
+    lowest, highest = limits
     bending = 4 * vehicle.thrust_coefficient * vehicle.lever
     roll, pitch = torque[0] / bending, torque[1] / bending
     reach, room = jnp.abs(roll) + jnp.abs(pitch), (highest - lowest) / 2
@@ -71,7 +65,49 @@ def allocate(vehicle: Vehicle, thrust: Any, torque: Components) -> Components:
         jnp.minimum(high_b - middle, middle - low_a),
     )
     a, b = middle - yaw, middle + yaw
-    return tuple(jnp.sqrt(square) for square in (a - first, b - second, a + first, b + second))
+    return a - first, b - second, a + first, b + second
+
+
+def _squares(vehicle: Vehicle, thrust: Any, torque: Components, limits: Components) -> Components:
+    """The squared rotor speeds of any layout in rpm^2, see `allocate`.
+
+    The squares are q_i = s r_i + t_i f + c_i y: roll and pitch torque give r, of which the share s is kept, and t and c
+    are what thrust and yaw torque need of each rotor. All q_i have to lie within the limits. These conditions bound y
+    once s and f are known; that such a y exists bounds f once s is known; and that such an f exists bounds s
+    (Fourier-Motzkin elimination). So s, f and y are found in this order, each as near as possible to what is asked.
+    """
+    square = vehicle.hover_rotor_speed_rpm**2  # everything is in units in which hovering takes 1
+    weight = vehicle.mass * vehicle.gravity
+    rows = jnp.asarray([(1, 1, 1, 1), *directions(vehicle)], float)
+    reach = jnp.max(jnp.abs(rows[1:3]))
+    columns = jnp.linalg.inv(rows / jnp.stack([1.0, reach, reach, 1.0])[:, None] / 4)
+    units = (weight, weight * reach, weight * reach, weight * vehicle.torque_coefficient / vehicle.thrust_coefficient)
+    wanted_thrust, roll, pitch, wanted_yaw = (part / unit for part, unit in zip((thrust, *torque), units, strict=True))
+    r = columns[:, 1] * roll + columns[:, 2] * pitch
+    t, c = columns[:, 0], columns[:, 3]
+    low, high = (limit / square for limit in limits)
+    # y <= upper_i - a_i s - b_i f and y >= lower_i - a_i s - b_i f, for each rotor i
+    a, b = r / c, t / c
+    upper, lower = jnp.where(c > 0, high, low) / c, jnp.where(c > 0, low, high) / c
+    # some y exists: g_k f <= h_k - e_k s, for each pair of rotors k
+    e, g = (jnp.ravel(part[:, None] - part[None]) for part in (a, b))
+    h = jnp.ravel(upper[:, None] - lower[None])
+    rises, falls = g > 0, g < 0
+    size = jnp.where(rises | falls, jnp.abs(g), 1.0)
+    e, h = e / size, h / size
+    # some f exists: the largest share s of roll and pitch torque, at most 1
+    pair = rises[:, None] & falls[None]
+    steep, room = e[:, None] + e[None], h[:, None] + h[None]
+    steep = jnp.concatenate([jnp.ravel(jnp.where(pair, steep, 0.0)), jnp.where(rises | falls, 0.0, e)])
+    room = jnp.concatenate([jnp.ravel(room), h])
+    share = jnp.min(jnp.where(steep > 0, room / jnp.where(steep > 0, steep, 1.0), 1.0), initial=1.0)
+    left = h - e * share
+    force = jnp.clip(
+        wanted_thrust, jnp.max(jnp.where(falls, -left, -jnp.inf)), jnp.min(jnp.where(rises, left, jnp.inf))
+    )
+    known = a * share + b * force
+    yaw = jnp.clip(wanted_yaw, jnp.max(lower - known), jnp.min(upper - known))
+    return tuple(jnp.clip(share * r + force * t + yaw * c, low, high) * square)
 
 
 def action_for(

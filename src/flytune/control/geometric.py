@@ -17,8 +17,8 @@ from flytune.control.actuation import action_for, allocate, estimated_rotor_spee
 from flytune.control.sensing import Sensed, body_axes, dot, heading, sense, wrapped
 from flytune.control.steering import slowed, specific_force
 from flytune.physics.components import Components, add, cross, scale
-from flytune.physics.dynamics import thrust_and_torque
 from flytune.physics.rotation import safe_norm
+from flytune.physics.rotors import thrust_and_torque
 from flytune.physics.vehicle import Vehicle
 
 Axes = tuple[Components, Components, Components]  # the columns of a rotation matrix
@@ -84,8 +84,8 @@ class Geometric:
             scale(-self.gains.body_rate, rate_error),
             scale(-1, cross(rate, reference)),
         )
-        adam_b1 = tuple(i * w for i, w in zip(inertia, rate, strict=True))
-        torque = add(tuple(i * a for i, a in zip(inertia, turn, strict=True)), cross(rate, adam_b1))
+        momentum = tuple(i * w for i, w in zip(inertia, rate, strict=True))
+        torque = add(tuple(i * a for i, a in zip(inertia, turn, strict=True)), cross(rate, momentum))
         thrust = self.vehicle.mass * dot(self.force(sensed.position_error, sensed.velocity), axes[2])
         speeds = allocate(self.vehicle, thrust, torque)
         return rotors, action_for(self.vehicle, rotors, speeds, self.gains.motor_time_constant)

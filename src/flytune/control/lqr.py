@@ -11,12 +11,13 @@ from scipy.linalg import solve_discrete_are
 
 from flytune.config.document import Real
 from flytune.config.pytree import pytree
-from flytune.control.actuation import PITCH, YAW, action_for, allocate, estimated_rotor_speed, hovering_rotors, mixed
+from flytune.control.actuation import action_for, allocate, estimated_rotor_speed, hovering_rotors
 from flytune.control.sensing import Sensed, heading, sense, wrapped
 from flytune.control.steering import shortened, slowed
 from flytune.errors import BadInput
 from flytune.physics import dynamics, rotation
 from flytune.physics.components import Components, pack, unpack
+from flytune.physics.rotors import directions, mixed
 from flytune.physics.vehicle import Vehicle
 
 STATES = 16
@@ -85,7 +86,7 @@ class Lqr:
         position = self.reachable(_turned(sensed.position_error, yaw))
         largest = self.gains.largest_yaw_error
         if self.body_rate_limit is not None:
-            largest = jnp.minimum(largest, self.body_rate_limit / self._ratio(YAW, 8, 11))
+            largest = jnp.minimum(largest, self.body_rate_limit / self._ratio(directions(self.vehicle)[2], 8, 11))
         yaw_error = jnp.clip(wrapped(yaw - self.target_yaw), -largest, largest)
         hover = self.vehicle.hover_rotor_speed_rpm
         speeds = ((speed / hover - 1) / self.vehicle.action_scale for speed in rotors)
@@ -94,12 +95,13 @@ class Lqr:
 
     def reachable(self, position_error: Components) -> Components:
         """The position error in m, cut until neither the speed nor the tilt that it asks for exceeds its limit."""
-        horizontal, vertical = self._ratio(PITCH, 0, 3), self._ratio((1, 1, 1, 1), 2, 5)
-        tilt_per_metre = jnp.abs(self._ratio(PITCH, 0, 7))
+        pitch = directions(self.vehicle)[1]
+        horizontal, vertical = self._ratio(pitch, 0, 3), self._ratio((1, 1, 1, 1), 2, 5)
+        tilt_per_metre = jnp.abs(self._ratio(pitch, 0, 7))
         error = slowed(position_error, (horizontal, horizontal, vertical), self.speed_limit)
         return *shortened(error[:2], self.tilt_limit / tilt_per_metre), error[2]
 
-    def _ratio(self, motors: tuple[int, ...], state: int, to: int) -> Any:
+    def _ratio(self, motors: Components, state: int, to: int) -> Any:
         """How one state weighs against another in what the motors do together."""
         row = jnp.asarray(motors, float) @ self.gain
         return row[state] / row[to]

@@ -8,6 +8,7 @@ from jaxtyping import Array, Float
 from flytune.config.pytree import pytree
 from flytune.physics import rotation
 from flytune.physics.components import Components, add, cross, scale, unpack
+from flytune.physics.rotors import thrust_and_torque
 from flytune.physics.vehicle import Vehicle
 
 CONTROL_PERIOD = 0.01  # s (paper R6)
@@ -51,30 +52,10 @@ def commanded_rotor_speed(vehicle: Vehicle, action: Any) -> Any:
     return jnp.minimum(wanted, vehicle.maximum_rotor_speed_rpm)
 
 
-def thrust_and_torque(vehicle: Vehicle, rotor_speed_rpm: Components) -> tuple[Any, Components]:
-    """Thrust along the body's z axis in N, and torque in the body frame in N m, of four rotor speeds in rpm.
-
-        f_i = kf rpm_i^2
-        tau_x = l (-f0 - f1 + f2 + f3)
-        tau_y = l (-f0 + f1 + f2 - f3)
-        tau_z = km (-rpm0^2 + rpm1^2 - rpm2^2 + rpm3^2)
-
-    Source: paper R4.
-    """
-    s0, s1, s2, s3 = (speed * speed for speed in rotor_speed_rpm)
-    bending = vehicle.thrust_coefficient * vehicle.lever
-    torque = (
-        bending * (-s0 - s1 + s2 + s3),
-        bending * (-s0 + s1 + s2 - s3),
-        vehicle.torque_coefficient * (-s0 + s1 - s2 + s3),
-    )
-    return vehicle.thrust_coefficient * (s0 + s1 + s2 + s3), torque
-
-
 def angular_acceleration(vehicle: Vehicle, body_rate: Components, torque: Components) -> Components:
     """w' = I^-1 (tau - w x I w) in rad/s^2, body frame. Source: paper R3."""
-    adam_b1 = tuple(i * w for i, w in zip(vehicle.inertia, body_rate, strict=True))
-    gyroscopic = cross(body_rate, adam_b1)
+    momentum = tuple(i * w for i, w in zip(vehicle.inertia, body_rate, strict=True))
+    gyroscopic = cross(body_rate, momentum)
     return tuple((t - g) / i for t, g, i in zip(torque, gyroscopic, vehicle.inertia, strict=True))
 
 

@@ -3,8 +3,9 @@
 import math
 from importlib import resources
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
+import numpy as np
 from annotated_types import Ge, Gt, Le, Unit
 
 from flytune.config import document
@@ -12,12 +13,46 @@ from flytune.config.document import Real, Whole
 from flytune.config.pytree import label, pytree, static
 from flytune.errors import BadInput
 
+Place = tuple[Annotated[Real, Unit("m")], Annotated[Real, Unit("m")]]
+Spin = Literal[-1, 1]
+
+
+@pytree
+class Rotors:
+    """A layout of four rotors other than the x configuration; x forward, y left, the origin at the centre of mass.
+
+    Four equal thrusts have to carry the vehicle without turning it, so that action 0 hovers (paper R5, R9).
+    """
+
+    place: tuple[Place, Place, Place, Place]  # x and y of each rotor
+    spin: tuple[Spin, Spin, Spin, Spin] = static()  # sign of the torque about z: 1 where the propeller turns clockwise
+
+    def problem(self) -> str | None:
+        """What makes the layout impossible, or None."""
+        place = np.array(self.place, float)
+        largest = np.linalg.norm(place, axis=1).max()
+        x, y = (float(part) for part in place.mean(axis=0))
+        if np.hypot(x, y) > 1e-6 * largest or largest == 0:
+            return f"place: the middle of the rotors, ({x:g}, {y:g}), is not (0, 0). Allowed: places whose mean is 0."
+        if sum(self.spin) != 0:
+            return f"spin: {list(self.spin)} turns the vehicle at hover. Allowed: two of 1 and two of -1."
+        # how the rotors have to differ to give yaw torque alone: the differences of place that cancel
+        alone = np.array(
+            [np.linalg.det(np.delete(np.c_[np.ones(4), place / largest], i, 0)) * (-1) ** i for i in range(4)]
+        )
+        if np.abs(alone).min() < 1e-3:
+            return "place: three rotors stand on one line. Allowed: no three on a line."
+        if abs(alone @ np.array(self.spin)) < 1e-3:
+            return "spin: yaw torque cannot be given alone. Allowed: neighbours that spin in opposite directions."
+        return None
+
 
 @pytree
 class Vehicle:
-    """A quadrotor in x configuration: mass, geometry, propellers, motors.
+    """A quadrotor: mass, geometry, propellers, motors.
 
-    Motors 0 (+x, -y), 1 (-x, -y), 2 (-x, +y), 3 (+x, +y); x forward, y left, z up (paper R4).
+    Without `rotors` the motors stand in x configuration: 0 (+x, -y), 1 (-x, -y), 2 (-x, +y), 3 (+x, +y), each `arm`
+    from the centre; x forward, y left, z up (paper R4).
     """
 
     name: str = label(default="custom")
@@ -27,7 +62,8 @@ class Vehicle:
         Annotated[Real, Gt(0), Unit("kg m^2")],
         Annotated[Real, Gt(0), Unit("kg m^2")],
     ]  # principal moments about x, y, z
-    arm: Annotated[Real, Gt(0), Unit("m")]  # from the centre to each motor; the lever is arm / sqrt(2)
+    arm: Annotated[Real | None, Gt(0), Unit("m")] = None  # x configuration: from the centre to each motor
+    rotors: Rotors | None = None  # another layout, in place of `arm`
     thrust_coefficient: Annotated[Real, Gt(0), Unit("N/rpm^2")]
     torque_coefficient: Annotated[Real, Gt(0), Unit("N m/rpm^2")]
     propeller_radius: Annotated[Real, Gt(0), Unit("m")]
@@ -54,7 +90,13 @@ class Vehicle:
 
     @property
     def lever(self) -> float:
-        """Distance of each motor from the x and from the y axis in metres, arm / sqrt(2) (paper R4)."""
+        """Distance of each motor from the x and from the y axis in metres, arm / sqrt(2) (paper R4).
+
+        Raises:
+            ValueError: the vehicle gives its rotors' places instead of an arm.
+        """
+        if self.arm is None:
+            raise ValueError("a vehicle with [rotors] has no single lever")
         return self.arm / math.sqrt(2)
 
     @property
@@ -65,6 +107,10 @@ class Vehicle:
 
     def problem(self) -> str | None:
         """What makes the numbers impossible together, or None."""
+        if self.arm is None and self.rotors is None:
+            return "arm: missing. Allowed: above 0 m, or a table [rotors] with the place and spin of each rotor."
+        if self.arm is not None and self.rotors is not None:
+            return "arm: stands beside [rotors], which say where the rotors are. Give one of the two."
         if self.maximum_rotor_speed_rpm <= self.hover_rotor_speed_rpm:
             return (
                 f"maximum_rotor_speed_rpm: {self.maximum_rotor_speed_rpm} cannot lift the vehicle. "

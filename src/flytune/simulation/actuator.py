@@ -9,9 +9,6 @@ from jaxtyping import Float
 
 from flytune.physics.vehicle import Vehicle
 
-SIDE = np.array([[1, -1], [-1, -1], [-1, 1], [1, 1]])  # of each motor on the x and y axis, in levers (paper R4)
-SPIN = np.array([-1, 1, -1, 1])  # sign of each motor's torque about z (paper R4)
-
 
 class Actuator:
     """The four rotors of each of N vehicles: speeds now, and the actions on their way to them."""

@@ -3,8 +3,8 @@
 import numpy as np
 from jaxtyping import Float
 
+from flytune.physics.rotors import places
 from flytune.physics.vehicle import Vehicle
-from flytune.simulation.actuator import SIDE
 from flytune.simulation.simulator import rotation_matrix, to_body, to_inertial
 
 GROUND_EFFECT_COEFFICIENT = 11.36859  # 1; gym-pybullet-drones (MIT licence), cf2x.urdf: gnd_eff_coeff
@@ -28,7 +28,7 @@ def ground_effect(
     height as in gym-pybullet-drones.
     """
     upwards = rotation_matrix(attitude)[:, 2]
-    height = position[:, 2:] + vehicle.lever * upwards[:, :2] @ SIDE.T
+    height = position[:, 2:] + upwards[:, :2] @ places(vehicle).T
     lowest = vehicle.propeller_radius / 4 * np.sqrt(GROUND_EFFECT_COEFFICIENT / LARGEST_GROUND_EFFECT)
     gain = GROUND_EFFECT_COEFFICIENT * (vehicle.propeller_radius / (4 * np.maximum(height, lowest))) ** 2
     return np.where(upwards[:, 2:] > 0, gain, 0.0)

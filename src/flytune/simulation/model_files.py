@@ -1,11 +1,12 @@
 """A vehicle as the files other simulators read: URDF and MJCF, with every number in full."""
 
+import math
 from collections.abc import Iterable
 from typing import Literal
 
 from flytune.physics.dynamics import CONTROL_PERIOD
+from flytune.physics.rotors import places, reach, spins, thrust
 from flytune.physics.vehicle import Vehicle
-from flytune.simulation.actuator import SIDE, SPIN
 
 Integrator = Literal["RK4", "Euler", "implicit", "implicitfast"]
 
@@ -18,6 +19,7 @@ def urdf(vehicle: Vehicle) -> str:
     It has no collision shapes, and URDF knows neither rotors nor drag: the forces are left to the caller.
     """
     ixx, iyy, izz = map(float, vehicle.inertia)
+    side = reach(vehicle) / math.sqrt(2)
     discs = "".join(
         f"""
     <visual>
@@ -38,7 +40,7 @@ def urdf(vehicle: Vehicle) -> str:
     </inertial>
     <visual>
       <geometry>
-        <box size="{vehicle.lever!r} {vehicle.lever!r} {THICKNESS}"/>
+        <box size="{side!r} {side!r} {THICKNESS}"/>
       </geometry>
     </visual>{discs}
   </link>
@@ -58,7 +60,8 @@ def mjcf(vehicle: Vehicle, *, timestep: float = CONTROL_PERIOD / 2, integrator: 
         integrator: by MuJoCo's names.
     """
     ratio = float(vehicle.torque_coefficient / vehicle.thrust_coefficient)
-    strongest = float(vehicle.thrust_coefficient * vehicle.maximum_rotor_speed_rpm**2)
+    strongest = float(thrust(vehicle, vehicle.maximum_rotor_speed_rpm**2))
+    half = reach(vehicle) / math.sqrt(8)
     disc = f"{float(vehicle.propeller_radius)!r} {THICKNESS / 2}"
     sites = "".join(
         f"""
@@ -70,7 +73,7 @@ def mjcf(vehicle: Vehicle, *, timestep: float = CONTROL_PERIOD / 2, integrator: 
         f"""
     <motor name="motor{motor}" site="motor{motor}" gear="0 0 1 0 0 {float(spin) * ratio!r}" ctrllimited="true"
            ctrlrange="0 {strongest!r}"/>"""
-        for motor, spin in enumerate(SPIN)
+        for motor, spin in enumerate(spins(vehicle))
     )
     return f"""<mujoco model="{_name(vehicle)}">
   <compiler angle="radian" inertiafromgeom="false"/>
@@ -86,7 +89,7 @@ def mjcf(vehicle: Vehicle, *, timestep: float = CONTROL_PERIOD / 2, integrator: 
     <body name="body">
       <freejoint name="free"/>
       <inertial pos="0 0 0" mass="{float(vehicle.mass)!r}" diaginertia="{_numbers(vehicle.inertia)}"/>
-      <geom type="box" size="{vehicle.lever / 2!r} {vehicle.lever / 2!r} {THICKNESS}" rgba="0.2 0.4 0.7 1"/>{sites}
+      <geom type="box" size="{half!r} {half!r} {THICKNESS}" rgba="0.2 0.4 0.7 1"/>{sites}
     </body>
   </worldbody>
   <actuator>{motors}
@@ -96,9 +99,8 @@ def mjcf(vehicle: Vehicle, *, timestep: float = CONTROL_PERIOD / 2, integrator: 
 
 
 def motor_positions(vehicle: Vehicle) -> list[list[float]]:
-    """Where the four motors sit in the body frame, m (paper R4)."""
-    lever = float(vehicle.lever)
-    return [[float(x) * lever, float(y) * lever, 0.0] for x, y in SIDE]
+    """Where the four motors sit in the body frame, m."""
+    return [[float(x), float(y), 0.0] for x, y in places(vehicle)]
 
 
 def _motor_places(vehicle: Vehicle) -> list[str]:

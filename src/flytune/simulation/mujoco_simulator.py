@@ -9,6 +9,7 @@ from flytune.config.document import Whole
 from flytune.config.pytree import pytree, static
 from flytune.extras import require
 from flytune.physics.dynamics import CONTROL_PERIOD
+from flytune.physics.rotors import thrust
 from flytune.physics.vehicle import Vehicle
 from flytune.simulation.actuator import Actuator
 from flytune.simulation.model_files import Integrator, mjcf
@@ -64,9 +65,9 @@ class MujocoSimulator:
         """Let one control period pass, see `World`."""
         self._actuator.command(action)
         speeds = [self._actuator.turn(self._period) for _ in range(self._options.physics_steps)]
-        thrust = self._vehicle.thrust_coefficient * np.stack(speeds, axis=1) ** 2
+        controls = thrust(self._vehicle, np.stack(speeds, axis=1) ** 2)
         self._state[:, 0] = 0.0  # time, on which nothing depends
-        states, _ = self._rollout.rollout(self._model, self._data, self._state, thrust)
+        states, _ = self._rollout.rollout(self._model, self._data, self._state, controls)
         self._state = np.array(states[:, -1])
 
     def body(self) -> VehicleStates:

@@ -12,8 +12,9 @@ from flytune.config.pytree import pytree, static
 from flytune.errors import BadInput
 from flytune.extras import require
 from flytune.physics.dynamics import CONTROL_PERIOD
+from flytune.physics.rotors import spins, thrust
 from flytune.physics.vehicle import Vehicle
-from flytune.simulation.actuator import SPIN, Actuator
+from flytune.simulation.actuator import Actuator
 from flytune.simulation.aerodynamics import ground_effect, rotor_drag
 from flytune.simulation.model_files import motor_positions, urdf
 from flytune.simulation.simulator import VehicleStates, to_body, to_inertial
@@ -50,7 +51,7 @@ class PyBulletSimulator:
         self._vehicle, self._options = vehicle, options
         self._period = CONTROL_PERIOD / options.physics_steps
         self._actuator = Actuator(vehicle, number)
-        self._motors = motor_positions(vehicle)
+        self._motors, self._spins = motor_positions(vehicle), np.array(spins(vehicle))
         self._drag = np.array(vehicle.drag, float)
         self._client = self._bullet.connect(self._bullet.DIRECT)
         if self._client < 0:
@@ -103,16 +104,16 @@ class PyBulletSimulator:
         """Apply the forces of a physics step: a thrust at each motor, their torque about z, and what the air does."""
         bullet, client, frame = self._bullet, self._client, self._bullet.LINK_FRAME
         squared = rotor_speed_rpm**2
-        thrust = self._vehicle.thrust_coefficient * squared
+        forces = thrust(self._vehicle, squared)
         if self._options.ground_effect or self._options.rotor_drag or self._drag.any():
-            thrust = self._resist(rotor_speed_rpm, thrust)
-        twist = self._vehicle.torque_coefficient * squared @ SPIN
-        for vehicle, forces, torque in zip(self._vehicles, thrust.tolist(), twist.tolist(), strict=True):
-            for motor, force in zip(self._motors, forces, strict=True):
+            forces = self._resist(rotor_speed_rpm, forces)
+        twist = self._vehicle.torque_coefficient * squared @ self._spins
+        for vehicle, pushes, torque in zip(self._vehicles, forces.tolist(), twist.tolist(), strict=True):
+            for motor, force in zip(self._motors, pushes, strict=True):
                 bullet.applyExternalForce(vehicle, BODY, (0, 0, force), motor, frame, client)
             bullet.applyExternalTorque(vehicle, BODY, (0, 0, torque), frame, client)
 
-    def _resist(self, rotor_speed_rpm: np.ndarray, thrust: np.ndarray) -> np.ndarray:
+    def _resist(self, rotor_speed_rpm: np.ndarray, forces: np.ndarray) -> np.ndarray:
         """The thrusts with ground effect; drag is applied on the way."""
         body = self.body()
         drag = -self._drag * body.velocity
@@ -121,8 +122,8 @@ class PyBulletSimulator:
         for vehicle, force, place in zip(self._vehicles, drag.tolist(), body.position.tolist(), strict=True):
             self._bullet.applyExternalForce(vehicle, BODY, force, place, self._bullet.WORLD_FRAME, self._client)
         if not self._options.ground_effect:
-            return thrust
-        return thrust * (1 + ground_effect(self._vehicle, body.position, body.attitude))
+            return forces
+        return forces * (1 + ground_effect(self._vehicle, body.position, body.attitude))
 
     def body(self) -> VehicleStates:
         """Where the vehicles are, see `World`."""
