@@ -11,7 +11,7 @@ Each command of the command line is one call here:
 - train: `train`; evaluate: `evaluate`, or `find_controller`, `fly` and `judge` one by one
 - compare, report: `evaluate_all`, then `compare` of the judgements, and `write_report`
 - tune, rules: `tune`, `load_rules`; reproduce: `reproduce`; bench: `bench`
-- export: `save_onnx`, `save_policy`; show: `load_task`, `write_task`
+- export: `export_policy`, or `save_onnx` and `save_policy`; show: `load_task`, `write_task`
 
 JAX is imported with the first name that needs it, not with the package.
 """
@@ -40,6 +40,7 @@ if TYPE_CHECKING:
     from flytune.evaluation.fly import fly as fly
     from flytune.evaluation.judge import Judgement as Judgement
     from flytune.evaluation.judge import judge as judge
+    from flytune.export import export_policy as export_policy
     from flytune.export.onnx import save_onnx as save_onnx
     from flytune.export.untrusted.onnx_controller import load_onnx as load_onnx
     from flytune.physics.vehicle import Vehicle as Vehicle
@@ -70,6 +71,7 @@ _MODULES = {
     "flytune.evaluation.flights": ("Flights",),
     "flytune.evaluation.fly": ("fly",),
     "flytune.evaluation.judge": ("Judgement", "judge"),
+    "flytune.export": ("export_policy",),
     "flytune.export.onnx": ("save_onnx",),
     "flytune.export.untrusted.onnx_controller": ("load_onnx",),
     "flytune.physics.vehicle": ("Vehicle", "load_vehicle"),

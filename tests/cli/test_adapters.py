@@ -110,7 +110,10 @@ def test_a_missing_package_is_named_with_its_remedy_and_nothing_is_written(
         (["evaluate", "pid", "--world", "mujoco", "--world-set", "integrator=magic"], "RK4"),
         (["evaluate", "broken.onnx"], "broken.onnx"),
         (["evaluate", "broken.zip"], "broken.zip"),
-        (["export", "pid", "--format", "onnx", "--out", "pid.onnx"], "pid: is not a policy of flytune"),
+        (
+            ["export", "pid", "--format", "onnx", "--out", "pid.onnx"],
+            "cannot be exported. Allowed: a policy with its weights",
+        ),
         (["export", "run", "--format", "onnx", "--out", "no/such/folder/policy.onnx"], "out: no/such/folder is no"),
         (["reproduce", "--seeds", "0"], "seeds: 0 is not allowed. Allowed: a whole number, 1 to 100"),
         (["reproduce", "--steps", "0"], "steps: 0 is not allowed. Allowed: a whole number, 1 or more"),
