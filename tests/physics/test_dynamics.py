@@ -152,11 +152,11 @@ def test_a_spin_without_torque_keeps_its_energy_and_its_angular_momentum(paper, 
     tumbling = dataclasses.replace(without_thrust(paper), inertia=(1.4e-5, 1.9e-5, 2.6e-5))
     inertia, rate = np.array(tumbling.inertia), np.array([0.2, 6.0, 0.1])
     flown = fly(tumbling, state(tumbling, body_rate=rate), np.zeros((1000, 4)))
-    adam_b1 = Rotation.from_quat(flown.attitude).apply(inertia * flown.body_rate)
+    momentum = Rotation.from_quat(flown.attitude).apply(inertia * flown.body_rate)
     assert flown.body_rate[:, 1].min() < -5  # it did turn over
     np.testing.assert_allclose(np.sum(inertia * flown.body_rate**2, axis=-1), rate @ (inertia * rate), rtol=1e-4)
     size = np.linalg.norm(inertia * rate)
-    np.testing.assert_allclose(adam_b1 / size, np.tile(inertia * rate / size, (1000, 1)), atol=5e-4)
+    np.testing.assert_allclose(momentum / size, np.tile(inertia * rate / size, (1000, 1)), atol=5e-4)
 
 
 @pytest.mark.parametrize("name", vehicle_names())

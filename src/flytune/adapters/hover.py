@@ -11,6 +11,7 @@ from flytune.extras import require
 from flytune.physics.dynamics import CONTROL_PERIOD
 from flytune.physics.rotors import places
 from flytune.task.observation import SIZE
+from flytune.task.situation import POSITION_BAND
 from flytune.task.task import Task, load_task
 
 if TYPE_CHECKING:
@@ -22,7 +23,6 @@ RENDER_MODES = ("rgb_array",)
 METADATA = {"render_modes": list(RENDER_MODES), "render_fps": round(1 / CONTROL_PERIOD)}
 TRAIL = 300  # steps of the way behind a vehicle that a picture shows
 FARTHEST = 1000.0  # m, also rad: of a start given by hand
-SETTLED = 0.02  # m, the sphere a picture shows around the target: the band in which a response counts as settled
 
 
 def read_task(task: str | Path | Task, edits: dict[str, Any] | None) -> Task:
@@ -141,7 +141,7 @@ def take_picture(task: Task, body: np.ndarray, trail: np.ndarray, steps: int, re
         propeller_radius=float(task.vehicle.propeller_radius),
         target=target,
         target_yaw=float(task.target.yaw),
-        band=SETTLED,
+        band=POSITION_BAND,
         trail=np.nan_to_num(trail).astype(float),
         lines=(
             ("time", f"{steps * CONTROL_PERIOD:.2f} s"),

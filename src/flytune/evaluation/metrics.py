@@ -1,4 +1,4 @@
-"""Step-response metrics: one number per trial from its error over time. NumPy only.
+"""Step-response metrics: one number per trial from its error over time, in NumPy.
 
 An error [N, K] is a value less its target: N trials of K = T + 1 samples at the control rate, the start (sample 0)
 and the end included. Its unit is the unit of the metric: m, or rad for yaw. Nothing here knows who flew, or on which
@@ -12,8 +12,9 @@ import math
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-POSITION_BAND = 0.02  # m; on x, y, z and on the distance to the target
-YAW_BAND = 0.02 * math.pi  # rad; 2 % of 180 deg
+from flytune.task.situation import POSITION_BAND as POSITION_BAND
+from flytune.task.situation import YAW_BAND as YAW_BAND
+
 SMALL_STEP = 0.1  # m; a shorter step has no meaningful overshoot or rise time
 SMALL_TURN = math.pi / 10  # rad; the same for yaw, 18 deg
 MINIMUM_STAY = 0.5  # s in the band before the end, for a trial to count as settled

@@ -1,5 +1,6 @@
 """The situation: how far a vehicle is from its target, worked out once and read by rewards and terminations alike."""
 
+import math
 from typing import Annotated
 
 import jax.numpy as jnp
@@ -11,6 +12,9 @@ from flytune.config.pytree import pytree
 from flytune.physics import rotation
 from flytune.physics.components import Components, unpack
 from flytune.physics.dynamics import State
+
+POSITION_BAND = 0.02  # m; on x, y, z and on the distance to the target: within it, a response counts as settled
+YAW_BAND = 0.02 * math.pi  # rad; 2 % of 180 deg
 
 
 @pytree
