@@ -259,7 +259,9 @@ def test_a_browser_shows_hostile_names_as_text(browser, hostile_evaluation, tmp_
     write_report(tmp_path / "report.html", [hostile_evaluation, hostile_evaluation])
     look_at(browser, tmp_path / "report.html")
     assert browser.evaluate("document.querySelector('h2').textContent").startswith(HOSTILE)
-    assert browser.evaluate("document.querySelector('.legendtext').textContent").startswith("<script>alert(1)</script>")
+    assert browser.evaluate("document.querySelector('.legendtext').textContent").startswith(
+        "2 <script>alert(1)</script>"
+    )
 
 
 @pytest.mark.browser
