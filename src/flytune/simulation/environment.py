@@ -1,4 +1,13 @@
-"""Episodes: reset, step and autoreset of one task, as pure functions for one vehicle; trainers apply `vmap`."""
+"""The environment: episodes of a task as pure functions for one vehicle; a rollout applies `vmap` to them.
+
+`reset` draws an episode, `observe` gives what a controller sees of it, `step` lets a control period pass and assesses the
+state it led to, and one of two endings says what comes after: `restart` begins a new episode where one is over, `hold`
+keeps a crashed vehicle where it is.
+"""
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -7,11 +16,18 @@ from jaxtyping import Array, Bool, Float, Int
 from flytune.config.pytree import pytree
 from flytune.physics import dynamics
 from flytune.physics.dynamics import State
-from flytune.task.observation import observe
+from flytune.physics.rotation import safe_norm
+from flytune.physics.vehicle import Vehicle
+from flytune.task import observation
+from flytune.task.family import TaskFamily
 from flytune.task.reward import rewards
-from flytune.task.situation import situation
+from flytune.task.situation import position_error, situation
 from flytune.task.task import Task
 from flytune.task.termination import SAFE, cause, margins
+
+CRASH_DISTANCE = 10.0  # m from the target; a vehicle beyond it has crashed
+
+Physics = Callable[[Vehicle, State, Float[Array, "4"]], State]  # the state one control period later, in JAX
 
 
 @pytree
@@ -20,8 +36,9 @@ class Episode:
 
     state: State
     last_action: Float[Array, "4"]  # the clipped action before; hover (0) after a reset
-    steps: Int[Array, ""]  # control steps since the start
+    steps: Int[Array, ""]  # control steps since the start; -1 in an episode that is held after a crash
     reward: Float[Array, ""]  # sum since the start
+    numbers: Any = ()  # of the task's family, drawn for this episode
 
 
 @pytree
@@ -32,36 +49,46 @@ class Outcome:
     terms: dict[str, Float[Array, ""]]  # the reward of each term; they add up to `reward`
     margins: dict[str, Float[Array, ""]]  # of each termination condition
     cause: Int[Array, ""]  # why the episode failed, an index into `causes(task.termination)`, or SAFE
-    terminated: Bool[Array, ""]  # failed; nothing comes after
+    terminated: Bool[Array, ""]  # the episode failed; nothing comes after
     truncated: Bool[Array, ""]  # the horizon is reached; what would come after still counts
 
 
-def reset(task: Task, key: jax.Array) -> Episode:
-    """A new episode at a state drawn from the task's initial states."""
+def begin(state: State, numbers: Any = ()) -> Episode:
+    """An episode that starts in a state, with the hover action (0) as its last one."""
     return Episode(
-        state=task.initial_state.draw(task.vehicle, key),
+        state=state,
         last_action=jnp.zeros(4),
         steps=jnp.zeros((), jnp.int32),
         reward=jnp.zeros(()),
+        numbers=numbers,
     )
 
 
-def look(task: Task, episode: Episode, normal: Float[Array, "13"]) -> Float[Array, "17"]:
+def reset(family: TaskFamily, key: jax.Array) -> Episode:
+    """A new episode: the family draws its numbers, and the task its initial state."""
+    numbers, key = family.draw(key)
+    task = family.member(numbers)
+    return begin(task.initial_state.draw(task.vehicle, key), numbers)
+
+
+def observe(task: Task, episode: Episode, normal: Float[Array, "13"]) -> Float[Array, "17"]:
     """The noisy observation of an episode, for 13 standard normal numbers."""
-    return observe(task.target, task.noise, episode.state, episode.last_action, normal)
+    return observation.observe(task.target, task.noise, episode.state, episode.last_action, normal)
 
 
-def step(task: Task, episode: Episode, action: Float[Array, "4"]) -> tuple[Episode, Outcome]:
-    """The episode one control period later, and what the step brought, judged on the true state it led to.
+def step(
+    task: Task, episode: Episode, action: Float[Array, "4"], physics: Physics = dynamics.step
+) -> tuple[Episode, Outcome]:
+    """The episode one control period later, and what the step brought, assessed on the true state it led to.
 
     The action is clipped to [-1, 1]; the clipped action is flown, penalised and later observed (paper R9).
     """
     action = jnp.clip(action, -1.0, 1.0)
-    return judge(task, episode, dynamics.step(task.vehicle, episode.state, action), action)
+    return assess(task, episode, physics(task.vehicle, episode.state, action), action)
 
 
-def judge(task: Task, episode: Episode, state: State, action: Float[Array, "4"]) -> tuple[Episode, Outcome]:
-    """The episode in the state that a clipped action led to, and what that is worth; whose physics did it is open."""
+def assess(task: Task, episode: Episode, state: State, action: Float[Array, "4"]) -> tuple[Episode, Outcome]:
+    """The episode in the state that a clipped action led to, and what that state is worth, in whichever simulator."""
     here = situation(task.target, state, action - episode.last_action)
     terms = rewards(task.reward, here)
     left = margins(task.termination, here)
@@ -76,10 +103,50 @@ def judge(task: Task, episode: Episode, state: State, action: Float[Array, "4"])
         terminated=terminated,
         truncated=(steps >= task.horizon) & ~terminated,
     )
-    return Episode(state=state, last_action=action, steps=steps, reward=episode.reward + outcome.reward), outcome
+    reward = episode.reward + outcome.reward
+    return dataclasses.replace(episode, state=state, last_action=action, steps=steps, reward=reward), outcome
 
 
-def autoreset(task: Task, episode: Episode, outcome: Outcome, key: jax.Array) -> Episode:
-    """The episode itself, or a new one drawn with `key` where it has ended."""
-    ended = outcome.terminated | outcome.truncated
-    return jax.tree.map(lambda new, old: jnp.where(ended, new, old), reset(task, key), episode)
+def with_slack(task: Task, moved: Episode, outcome: Outcome, slack: Any) -> Outcome:
+    """The outcome where an episode goes on until a margin is overdrawn by more than `slack`, a share of its bound.
+
+    Where an episode ends at the bound itself, a gradient never sees what lies beyond: a barrier is then weakest just
+    where it is needed.
+    """
+    beyond = cause({name: margin + slack for name, margin in outcome.margins.items()})
+    terminated = beyond != SAFE
+    truncated = (moved.steps >= task.horizon) & ~terminated
+    return dataclasses.replace(outcome, cause=beyond, terminated=terminated, truncated=truncated)
+
+
+def restart(
+    family: TaskFamily, before: Episode, moved: Episode, outcome: Outcome, key: jax.Array
+) -> tuple[Episode, Bool[Array, ""]]:
+    """The episode itself, or a new one drawn with `key` where it is over; and whether it is over."""
+    over = outcome.terminated | outcome.truncated
+    return jax.tree.map(lambda new, old: jnp.where(over, new, old), reset(family, key), moved), over
+
+
+def hold(
+    family: TaskFamily, before: Episode, moved: Episode, outcome: Outcome, key: None = None
+) -> tuple[Episode, Bool[Array, ""]]:
+    """The episode itself, or from a crash on the one before it; and whether the vehicle has crashed.
+
+    Terminations end nothing here. The steps of a held episode are -1.
+    """
+    crashed = (before.steps < 0) | is_crashed(family.member(moved.numbers), moved.state)
+    held = dataclasses.replace(before, steps=jnp.full_like(before.steps, -1))
+    return jax.tree.map(lambda new, old: jnp.where(crashed, old, new), moved, held), crashed
+
+
+def is_crashed(task: Task, state: State) -> Bool[Array, ""]:
+    """Whether a vehicle has crashed: it left the ball around its target, or its state is not finite."""
+    distance = safe_norm(position_error(task.target, state.position))
+    body = jnp.stack([*state.position, *state.attitude, *state.velocity, *state.body_rate])
+    return ~((distance <= CRASH_DISTANCE) & jnp.all(jnp.isfinite(body)))
+
+
+def margins_along(task: Task, states: State, actions: Float[Array, "T 4"]) -> dict[str, Float[Array, "T"]]:
+    """The margin of each termination at every sample of one trial, first axis time; `states` [T, ...] likewise."""
+    changes = jnp.diff(actions, axis=0, prepend=jnp.zeros_like(actions[:1]))
+    return jax.vmap(lambda s, change: margins(task.termination, situation(task.target, s, change)))(states, changes)

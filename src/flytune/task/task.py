@@ -6,6 +6,7 @@ from importlib import resources
 from pathlib import Path
 from typing import Annotated, Any
 
+import jax
 from annotated_types import Ge, Gt, Le, Unit
 
 from flytune.config import document, nested
@@ -69,6 +70,14 @@ class Task:
     def speed_bound(self) -> float | None:
         """The tightest bound on speed in m/s, or None where there is none."""
         return self.limit("speed")
+
+    def draw(self, key: jax.Array) -> tuple[tuple[()], jax.Array]:
+        """No numbers, and the key itself: a task is a family of one, see `TaskFamily`."""
+        return (), key
+
+    def member(self, numbers: tuple[()]) -> "Task":
+        """The task itself."""
+        return self
 
     def problem(self) -> str | None:
         """What makes the numbers impossible together, or None."""

@@ -16,11 +16,10 @@ from jaxtyping import Array, Float
 
 from flytune.config.pytree import pytree
 from flytune.control.policy import Network, Policy, make_network
-from flytune.simulation import environment
 from flytune.simulation.environment import Episode, Outcome
+from flytune.simulation.rollout import Draw, reset_all, rollout
 from flytune.task.observation import NOISY, SIZE, input_scale
 from flytune.task.task import Task
-from flytune.task.termination import SAFE, cause
 from flytune.task.training_settings import ApgSettings
 from flytune.training.optimiser import averaged, descend
 from flytune.training.rollout_metrics import account
@@ -63,7 +62,7 @@ def start(task: Task, settings: ApgSettings, key: Array) -> TrainState:
     actor_key, episode_key, key = jax.random.split(key, 3)
     actor = make_network(actor_key, (SIZE, *settings.hidden, 4), last_gain=0.01)
     keys = jax.random.split(episode_key, settings.environments)
-    episodes = jax.vmap(partial(environment.reset, task), out_axes=-1)(keys)
+    episodes = reset_all(task, keys)
     return TrainState(
         actor=actor,
         ema=actor,
@@ -77,18 +76,6 @@ def start(task: Task, settings: ApgSettings, key: Array) -> TrainState:
 def barrier(margin: Float[Array, ""], settings: ApgSettings) -> Float[Array, ""]:
     """What a margin costs: weight * max(0, barrier_margin - margin)^2, nothing while more than that is left."""
     return settings.barrier_weight * jnp.maximum(settings.barrier_margin - margin, 0.0) ** 2
-
-
-def forgiven(task: Task, moved: Episode, outcome: Outcome, settings: ApgSettings) -> Outcome:
-    """The outcome of a training episode, which goes on until a margin is overdrawn by more than `settings.termination_slack`.
-
-    Where the episode ends at the bound itself, the gradient never sees what lies beyond: the barrier is then weakest
-    just where it is needed.
-    """
-    beyond = cause({name: margin + settings.termination_slack for name, margin in outcome.margins.items()})
-    terminated = beyond != SAFE
-    truncated = (moved.steps >= task.horizon) & ~terminated
-    return dataclasses.replace(outcome, cause=beyond, terminated=terminated, truncated=truncated)
 
 
 def warm_start(settings: ApgSettings, train_state: TrainState, policy: Policy) -> TrainState:
@@ -124,30 +111,24 @@ def update(task: Task, settings: ApgSettings, train_state: TrainState) -> tuple[
 
 
 def _loss(task: Task, settings: ApgSettings, actor: Network, episodes: Episode, key: Array) -> Any:
-    """Mean cost per step of the whole batch, and the episodes it ends with.
-
-    The batch is the last axis: arithmetic on scalars per vehicle then runs along contiguous memory. Of the physics,
-    only the episodes between steps are kept for the gradient; what happens within a step is worked out again.
-    """
+    """Mean cost per step of the whole batch, and the episodes it ends with."""
     task = dataclasses.replace(task, initial_state=settings.initial_state)
     scale = input_scale(settings.input_scale)
-
-    def one_step(episode: Episode, action: Array, reset_key: Array) -> Any:
-        moved, outcome = environment.step(task, episode, action)
-        cost = sum((barrier(margin, settings) for margin in outcome.margins.values()), start=jnp.zeros(()))
-        outcome = forgiven(task, moved, outcome, settings)
-        return environment.autoreset(task, moved, outcome, reset_key), (outcome.reward - cost, outcome, moved)
-
-    step = jax.checkpoint(jax.vmap(one_step, in_axes=-1, out_axes=-1), prevent_cse=False)
-    look = jax.checkpoint(jax.vmap(partial(environment.look, task), in_axes=-1, out_axes=0), prevent_cse=False)
     noise_key, reset_key = jax.random.split(key)
-    noise = jax.random.normal(noise_key, (settings.window, NOISY, settings.environments))
-    reset_keys = jax.random.split(reset_key, (settings.window, settings.environments))
+    draws = Draw(
+        noise=jax.random.normal(noise_key, (settings.window, NOISY, settings.environments)),
+        keys=jax.random.split(reset_key, (settings.window, settings.environments)),
+    )
 
-    def advance(episodes: Episode, now: tuple[Array, Array]) -> Any:
-        normal, keys = now
-        action = jnp.tanh(actor(look(episodes, normal) * scale))
-        return step(episodes, action.T, keys)
+    def decide(memory: Any, observation: Array, draw: Any, episodes: Episode) -> Any:
+        return memory, jnp.tanh(actor(observation * scale)), ()
 
-    episodes, (worth, outcome, moved) = jax.lax.scan(advance, episodes, (noise, reset_keys))
+    def record(after: Episode, moved: Episode, outcome: Outcome) -> Any:
+        cost = sum((barrier(margin, settings) for margin in outcome.margins.values()), start=jnp.zeros(()))
+        return outcome.reward - cost, outcome, moved
+
+    (episodes, _), step = rollout(
+        task, decide, (episodes, ()), draws, record=record, slack=settings.termination_slack, rematerialise=True
+    )
+    worth, outcome, moved = step.record
     return -jnp.mean(worth), (episodes, {**account(task, outcome, moved), "objective": jnp.mean(worth)})

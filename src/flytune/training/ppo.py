@@ -19,8 +19,9 @@ from jaxtyping import Array, Float
 
 from flytune.config.pytree import pytree
 from flytune.control.policy import Network, Policy, make_network
-from flytune.simulation import environment
 from flytune.simulation.environment import Episode
+from flytune.simulation.rollout import Draw, reset_all
+from flytune.simulation.rollout import rollout as simulate
 from flytune.task.observation import NOISY, SIZE, input_scale
 from flytune.task.task import Task
 from flytune.task.training_settings import PpoSettings
@@ -84,7 +85,7 @@ def start(task: Task, settings: PpoSettings, key: Array) -> TrainState:
         parameters=parameters,
         ema=parameters.actor,
         optimiser=_optimiser(settings, parameters).init(ravel_pytree(parameters)[0]),
-        episodes=jax.vmap(partial(environment.reset, task), out_axes=-1)(keys),
+        episodes=reset_all(task, keys),
         key=key,
         updates=jnp.zeros((), jnp.int32),
     )
@@ -117,26 +118,24 @@ def rollout(
     noise_key, action_key, reset_key = jax.random.split(key, 3)
     steps, width = settings.rollout, settings.environments
     noise = jax.random.normal(noise_key, (steps + 1, NOISY, width))
-    draws = jax.random.normal(action_key, (steps, width, 4))
-    reset_keys = jax.random.split(reset_key, (steps, width))
+    draws = Draw(
+        noise=noise[:-1],
+        keys=jax.random.split(reset_key, (steps, width)),
+        controller=jax.random.normal(action_key, (steps, width, 4)),
+        next_noise=noise[1:],  # before a reset: what a truncated episode would have gone on from
+    )
     factor = input_scale(settings.input_scale)
-    look = jax.vmap(lambda episode, normal: environment.look(task, episode, normal) * factor, in_axes=-1, out_axes=0)
 
-    def advance(episodes: Episode, now: Any) -> Any:
-        noise_now, noise_next, draw, reset_keys = now
-        seen = look(episodes, noise_now)
+    def decide(memory: Any, observation: Array, draw: Array, episodes: Episode) -> Any:
+        seen = observation * factor
         mean = parameters.actor(seen)
         action = mean + jnp.exp(parameters.log_std) * draw
-        moved, outcome = jax.vmap(partial(environment.step, task), in_axes=(-1, 0), out_axes=-1)(episodes, action)
-        following = look(moved, noise_next)  # before a reset: what a truncated episode would have gone on from
-        after = jax.vmap(partial(environment.autoreset, task), in_axes=(-1, -1, 0), out_axes=-1)(
-            moved, outcome, reset_keys
-        )
-        return after, (seen, mean, action, following, outcome, moved)
+        return memory, action, (seen, mean, action)
 
-    episodes, (seen, mean, action, following, outcome, moved) = jax.lax.scan(
-        advance, episodes, (noise[:-1], noise[1:], draws, reset_keys)
+    (episodes, _), step = simulate(
+        task, decide, (episodes, ()), draws, record=lambda after, moved, outcome: (outcome, moved)
     )
+    (seen, mean, action), following, (outcome, moved) = step.notes, step.following * factor, step.record
     value, next_value = parameters.critic(seen)[..., 0], parameters.critic(following)[..., 0]
     advantage = advantages(
         outcome.reward,

@@ -1,0 +1,22 @@
+"""Families of tasks: what a rollout flies, where some numbers of the task or the vehicle change from episode to episode."""
+
+from typing import Any, Protocol
+
+import jax
+
+from flytune.task.task import Task
+
+
+class TaskFamily(Protocol):
+    """Tasks of one structure that differ in numbers: a bound that a dial sets, a mass that is drawn per episode.
+
+    A `Task` is the family of one: its `draw` draws nothing, and its `member` is the task itself.
+    """
+
+    def draw(self, key: jax.Array) -> tuple[Any, jax.Array]:
+        """The numbers of one episode, a pytree of scalars, and the key that is left for its initial state."""
+        ...
+
+    def member(self, numbers: Any) -> Task:
+        """The task with these numbers; inside compiled code they are tracers."""
+        ...
