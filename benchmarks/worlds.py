@@ -106,7 +106,7 @@ def fly_open_loop(vehicle: Vehicle, actions: np.ndarray, name: str, options: dic
     for action in [None, *actions]:
         if action is not None:
             simulator.advance(action[None])
-        body = simulator.body()
+        body = simulator.states()
         flown.append(np.concatenate([body.position[0], body.attitude[0], body.velocity[0], body.body_rate[0]]))
     simulator.close()
     return np.array(flown)

@@ -9,20 +9,25 @@ import pytest
 
 from flytune.config.pytree import pytree
 from flytune.errors import BadInput, Diverged
-from flytune.evaluation.fly import fly
+from flytune.evaluation.fly import _begin, fly, rollout_trials, trial_keys
 from flytune.evaluation.judge import judge
-from flytune.evaluation.lockstep import fly_in_simulator
-from flytune.evaluation.trial import trial_keys
 from flytune.physics.dynamics import hovering
+from flytune.simulation.jax_simulator import JaxSimulator
 from flytune.simulation.simulators import make_simulator
 from flytune.task.initial_state import EVALUATION_INITIAL_STATES
 from flytune.task.situation import situation
 from flytune.task.task import load_task
 from flytune.task.termination import margins
 
-# flytune's own world with an option is flown like the others, step by step
-STEP_BY_STEP = {"physics_steps": 1}
 FIELDS = ("position", "attitude", "velocity", "body_rate", "rotor_speed_rpm", "action")
+
+
+class StepByStep(JaxSimulator):
+    """flytune's simulator, flown like one that JAX cannot look into."""
+
+    def __init__(self, vehicle, number):
+        super().__init__(vehicle, number)
+        self.physics = None
 
 
 @pytree
@@ -78,10 +83,11 @@ def task():
 
 @pytest.fixture(params=["flytune", "pybullet", "mujoco"])
 def simulator(request):
-    """A world's name and options, such that its trials are flown step by step."""
-    if request.param != "flytune":
-        pytest.importorskip(request.param, reason=f"needs flytune[{request.param}]")
-    return {"simulator": request.param, "simulator_options": STEP_BY_STEP if request.param == "flytune" else None}
+    """A simulator whose trials are flown step by step."""
+    if request.param == "flytune":
+        return StepByStep
+    pytest.importorskip(request.param, reason=f"needs flytune[{request.param}]")
+    return request.param
 
 
 @pytest.fixture(scope="module")
@@ -98,13 +104,9 @@ def noise_shown(flights):
 
 def test_every_world_begins_at_the_same_starts_and_shows_the_same_noise(task, own, simulator):
     echo, _ = own
-    flights = fly(Echo(gain=jnp.float32(0.05)), task, trials=8, duration=0.6, name="echo", **simulator)
-    assert (flights.simulator, flights.name, flights.trials, flights.duration) == (
-        simulator["simulator"],
-        "echo",
-        8,
-        0.6,
-    )
+    flights = fly(Echo(gain=jnp.float32(0.05)), task, trials=8, duration=0.6, name="echo", simulator=simulator)
+    named = simulator if isinstance(simulator, str) else "StepByStep"
+    assert (flights.simulator, flights.name, flights.trials, flights.duration) == (named, "echo", 8, 0.6)
     for name in FIELDS:
         np.testing.assert_array_equal(getattr(flights, name)[:, 0], getattr(echo, name)[:, 0], err_msg=name)
     # the first observation is the same number for number, also the attitude in the fourth
@@ -117,14 +119,7 @@ def test_every_world_begins_at_the_same_starts_and_shows_the_same_noise(task, ow
 def test_flown_step_by_step_or_at_once_is_the_same(task, own):
     both = (own[0], Echo(gain=jnp.float32(0.05)), 0.6), (own[1], Diver(), 2.0)
     for at_once, controller, duration in both:
-        stepped = fly(
-            controller,
-            task,
-            trials=at_once.trials,
-            duration=duration,
-            simulator="flytune",
-            simulator_options=STEP_BY_STEP,
-        )
+        stepped = fly(controller, task, trials=at_once.trials, duration=duration, simulator=StepByStep)
         for name in FIELDS:
             np.testing.assert_allclose(getattr(stepped, name), getattr(at_once, name), atol=2e-5, rtol=1e-6)
         for name, margin in at_once.margins.items():
@@ -135,7 +130,7 @@ def test_flown_step_by_step_or_at_once_is_the_same(task, own):
 
 def test_a_crash_is_counted_and_held_and_the_others_fly_on(task, own, simulator):
     _, diver = own
-    flights = fly(Diver(), task, trials=8, duration=2.0, **simulator)
+    flights = fly(Diver(), task, trials=8, duration=2.0, simulator=simulator)
     assert 0 < diver.crashed.sum() < 8
     np.testing.assert_array_equal(flights.crashed, diver.crashed)
     assert int(judge(flights).crashed.sum()) == int(diver.crashed.sum())
@@ -152,18 +147,18 @@ def test_a_crash_is_counted_and_held_and_the_others_fly_on(task, own, simulator)
 @pytest.mark.parametrize("target", [0.0, 9.5])  # some crash on the way; some begin lost
 def test_a_crashed_vehicle_waits_at_the_target(task, simulator, target):
     there = dataclasses.replace(task, target=dataclasses.replace(task.target, position=(target, 0.0, 1.0)))
-    simulator = make_simulator(simulator["simulator"], there.vehicle, 8, simulator["simulator_options"])
-    keys, initial_conditions = trial_keys(1, 8), EVALUATION_INITIAL_STATES["clear"]
-    crashed = fly_in_simulator(simulator, Diver(), there, initial_conditions, keys, 200, "diver")[3]
-    away = np.linalg.norm(simulator.body().position - there.target.position, axis=-1)
-    simulator.close()
+    made = make_simulator(simulator, there.vehicle, 8) if isinstance(simulator, str) else simulator(there.vehicle, 8)
+    starts, noise_keys = _begin(there, EVALUATION_INITIAL_STATES["clear"], trial_keys(1, 8))
+    crashed = rollout_trials(made, Diver(), there, starts, noise_keys, 200, "diver").crashed
+    away = np.linalg.norm(made.states().position - there.target.position, axis=-1)
+    made.close()
     assert 0 < crashed.sum() < 8
     assert away[crashed].max() < 1e-3 and away[~crashed].min() > 0.1
 
 
 def test_a_trial_that_begins_lost_is_crashed_from_the_start(task, simulator):
     far = dataclasses.replace(task, target=dataclasses.replace(task.target, position=(9.5, 0.0, 1.0)))
-    flights = fly(Echo(gain=jnp.float32(0.0)), far, trials=8, duration=0.6, **simulator)
+    flights = fly(Echo(gain=jnp.float32(0.0)), far, trials=8, duration=0.6, simulator=simulator)
     lost = np.linalg.norm(flights.position[:, 0] - [9.5, 0, 1], axis=-1) > 10
     assert 0 < lost.sum() < 8
     np.testing.assert_array_equal(flights.crashed, lost)
@@ -171,7 +166,7 @@ def test_a_trial_that_begins_lost_is_crashed_from_the_start(task, simulator):
 
 
 def test_margins_are_those_of_the_recorded_state(task, simulator):
-    flights = fly(Echo(gain=jnp.float32(0.05)), task, trials=8, duration=0.6, **simulator)
+    flights = fly(Echo(gain=jnp.float32(0.05)), task, trials=8, duration=0.6, simulator=simulator)
     assert set(flights.margins) == set(task.termination)
     parts = {name: tuple(getattr(flights, name)[1, 40]) for name in FIELDS[1:4]}
     state = dataclasses.replace(hovering(task.vehicle, tuple(flights.position[1, 40])), **parts)
@@ -185,12 +180,12 @@ def test_an_action_that_is_not_finite_is_reported_with_its_trial_and_time(task, 
     breaker = Breaker(beyond=jnp.float32(np.sort(side)[-2:].mean()))
     complaint = rf"^wreck: action .*nan.* not finite in trial {np.argmax(side)} at 0\.05 s, on a finite observation\.$"
     with pytest.raises(Diverged, match=complaint):
-        fly(breaker, task, trials=8, duration=0.6, name="wreck", **simulator)
+        fly(breaker, task, trials=8, duration=0.6, name="wreck", simulator=simulator)
 
 
 def test_vehicles_with_lag_and_latency_are_flown_too(simulator):
     late = load_task("baseline", {"vehicle": "crazyflie-measured", "vehicle.action_latency_steps": 2})
-    flights = fly(Echo(gain=jnp.float32(0.05)), late, trials=8, duration=0.6, **simulator)
+    flights = fly(Echo(gain=jnp.float32(0.05)), late, trials=8, duration=0.6, simulator=simulator)
     own = fly(Echo(gain=jnp.float32(0.05)), late, trials=8, duration=0.6)
     hover = late.vehicle.hover_rotor_speed_rpm
     np.testing.assert_allclose(flights.rotor_speed_rpm[:, :3], hover, rtol=1e-6)  # two steps late, still hover

@@ -75,7 +75,7 @@ def fly(name, vehicle, start, actions, **options):
     simulator.place(start)
     for action in actions:
         simulator.advance(action)
-    end = simulator.body()
+    end = simulator.states()
     simulator.close()
     return end
 
@@ -97,9 +97,9 @@ def test_placing_some_vehicles_leaves_the_others(name, paper):
     simulator, start = make_simulator(name, paper, 6), moving(paper)
     simulator.place(start)
     simulator.advance(np.zeros((6, 4)))
-    before = simulator.body()
+    before = simulator.states()
     simulator.place(body(paper, 2, position=[[5, 5, 5], [6, 6, 6]]), np.array([1, 4]))
-    after = simulator.body()
+    after = simulator.states()
     simulator.close()
     others = [0, 2, 3, 5]
     for part in STATE:
@@ -259,9 +259,9 @@ def test_frames_of_a_moving_body_agree_with_its_way(name, ballistic):
     # the attitude must turn by the body rate that is reported: R^T dR = w dt, at the middle of a period
     simulator = make_simulator(name, ballistic, 6, {"physics_steps": 20})
     simulator.place(moving(ballistic))
-    before = simulator.body()
+    before = simulator.states()
     simulator.advance(np.full((6, 4), -1.0))
-    after = simulator.body()
+    after = simulator.states()
     simulator.close()
     turned = (Rotation.from_quat(before.attitude).inv() * Rotation.from_quat(after.attitude)).as_rotvec()
     middle = (before.body_rate + after.body_rate) / 2

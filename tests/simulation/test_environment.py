@@ -1,4 +1,4 @@
-"""Episodes: reset, step and autoreset, for every preset and vehicle (paper R7 to R15)."""
+"""Episodes: reset, observe, step and restart, for every preset and vehicle (paper R7 to R15)."""
 
 import dataclasses
 import itertools
@@ -24,8 +24,8 @@ ACTION = (0.3, -0.2, 0.1, -0.4)
 
 @pytest.fixture(scope="module")
 def compiled():
-    """reset, step, look and autoreset, compiled once and shared; labels do not matter to the cache."""
-    names = ("reset", "step", "look", "autoreset")
+    """reset, step and observe, compiled once and shared; labels do not matter to the cache."""
+    names = ("reset", "step", "observe")
     return dict(zip(names, (jax.jit(getattr(environment, name)) for name in names), strict=True))
 
 
@@ -94,7 +94,7 @@ def test_the_clipped_action_is_flown_penalised_and_observed(compiled, baseline):
     same(one, other)
     # |da|^2 = 1 + 1 + 0.25 + 1
     assert float(one[1].terms["smoothness"]) == pytest.approx(-0.1 * 3.25, rel=1e-6)
-    seen = compiled["look"](baseline, one[0], jnp.zeros(13))
+    seen = compiled["observe"](baseline, one[0], jnp.zeros(13))
     np.testing.assert_array_equal(seen[13:], tame)
 
 
@@ -102,7 +102,7 @@ def test_what_the_pilot_sees_is_the_observation_of_the_episode(compiled, baselin
     here = episode(baseline, position=(0.4, -0.2, 1.1), last_action=ACTION)
     normal = jax.random.normal(jax.random.key(0), (13,))
     expected = observe(baseline.target, baseline.noise, here.state, here.last_action, normal)
-    np.testing.assert_allclose(compiled["look"](baseline, here, normal), expected, rtol=1e-6, atol=1e-7)
+    np.testing.assert_allclose(compiled["observe"](baseline, here, normal), expected, rtol=1e-6, atol=1e-7)
 
 
 # --- ends ---
@@ -137,7 +137,7 @@ def test_a_failure_at_the_horizon_is_a_failure_and_no_truncation(compiled, basel
     assert (bool(outcome.terminated), bool(outcome.truncated)) == (True, False)
 
 
-def test_autoreset_replaces_the_episodes_that_have_ended_and_no_others(baseline):
+def test_restart_replaces_the_episodes_that_have_ended_and_no_others(baseline):
     cases = [{}, {"velocity": (0.9, 0, 0)}, {"steps": 499}, {"steps": 10, "position": (0.5, 0.5, 1.0)}]
     batch = jax.tree.map(lambda *leaves: jnp.stack(leaves), *(episode(baseline, **case) for case in cases))
     keys = jax.random.split(jax.random.key(7), 4)
@@ -145,11 +145,12 @@ def test_autoreset_replaces_the_episodes_that_have_ended_and_no_others(baseline)
     @jax.jit
     def advance(batch, keys):
         after, outcome = jax.vmap(lambda e: environment.step(baseline, e, jnp.array(ACTION)))(batch)
-        renewed = jax.vmap(lambda e, o, k: environment.autoreset(baseline, e, o, k))(after, outcome, keys)
-        return after, outcome, renewed, jax.vmap(lambda k: environment.reset(baseline, k))(keys)
+        renew = jax.vmap(lambda b, e, o, k: environment.restart(baseline, b, e, o, k))
+        renewed, over = renew(batch, after, outcome, keys)
+        return after, outcome, renewed, over, jax.vmap(lambda k: environment.reset(baseline, k))(keys)
 
-    after, outcome, renewed, fresh = advance(batch, keys)
-    assert (outcome.terminated | outcome.truncated).tolist() == [False, True, True, False]
+    after, outcome, renewed, over, fresh = advance(batch, keys)
+    assert (outcome.terminated | outcome.truncated).tolist() == over.tolist() == [False, True, True, False]
     for index, ended in enumerate([False, True, True, False]):
         expected = fresh if ended else after
         same([leaf[index] for leaf in jax.tree.leaves(renewed)], [leaf[index] for leaf in jax.tree.leaves(expected)])

@@ -34,7 +34,7 @@ def fly(vehicle, steps, *, height=1.0, velocity=(0, 0, 0), body_rate=(0, 0, 0), 
     )
     for _ in range(steps):
         simulator.advance(np.full((1, 4), action))
-    end = simulator.body()
+    end = simulator.states()
     simulator.close()
     return end
 
@@ -90,5 +90,5 @@ def test_a_world_can_be_closed_twice_and_others_live_on(paper):
     first.close()
     first.close()
     second.advance(np.zeros((1, 4)))
-    assert np.isfinite(second.body().position).all()
+    assert np.isfinite(second.states().position).all()
     second.close()

@@ -204,7 +204,7 @@ def test_flytunes_world_is_flytunes_physics(late):
         simulator.advance(np.stack([0 * action, action]))
         state = step(late, state, jnp.asarray(action))
     for name in ("position", "attitude", "velocity", "body_rate", "rotor_speed_rpm"):
-        found = getattr(simulator.body(), name)[1]
+        found = getattr(simulator.states(), name)[1]
         np.testing.assert_allclose(found, np.array(getattr(state, name)), atol=1e-6, rtol=1e-6, err_msg=name)
 
 

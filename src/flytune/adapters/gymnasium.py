@@ -7,6 +7,8 @@ from collections import deque
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 
 from flytune.adapters import registration
@@ -20,13 +22,16 @@ from flytune.adapters.hover import (
     read_task,
     take_picture,
 )
-from flytune.adapters.single import Single
 from flytune.adapters.vector import HoverVectorEnv
 from flytune.extras import require
-from flytune.simulation import simulators
+from flytune.physics.dynamics import hovering
+from flytune.physics.rotation import from_euler
+from flytune.simulation.host import HostEnvironment, draw_episodes, episodes_at
+from flytune.simulation.simulator import state_numbers
+from flytune.simulation.simulators import make_simulator
 from flytune.task.observation import NOISY
 from flytune.task.task import Task
-from flytune.task.termination import SAFE, causes
+from flytune.task.termination import causes
 
 if TYPE_CHECKING:
     import gymnasium
@@ -69,9 +74,8 @@ class HoverEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         self.task = read_task(task, edits)
         self.render_mode = read_render_mode(render_mode)
         self.observation_space, self.action_space = make_spaces()
-        own = simulator == "flytune" and not simulator_options
-        made = None if own else simulators.make_simulator(simulator, self.task.vehicle, 1, simulator_options)
-        self._single = Single(self.task, made)
+        flown_in = make_simulator(simulator, self.task.vehicle, 1, simulator_options)
+        self._environment = HostEnvironment(self.task, flown_in, 1, ending="none")
         self._causes = causes(self.task.termination)
         self._trail: deque[np.ndarray] = deque(maxlen=TRAIL)
         self._steps, self._reward = 0, 0.0
@@ -91,11 +95,12 @@ class HoverEnv(gymnasium.Env[np.ndarray, np.ndarray]):
             BadInput: an unknown option or an impossible start.
         """
         super().reset(seed=seed)
-        start = read_start(options)
-        observation = self._single.begin(int(self.np_random.integers(2**32)), self._noise(), start)
+        start, seed = read_start(options), int(self.np_random.integers(2**32))
+        episodes = draw_episodes(self.task, jax.random.key(seed)[None]) if start is None else self._at(**start)
+        observation = self._environment.start(episodes, self._noise())[0]
         self._steps, self._reward, self._state = 0, 0.0, "flying"
         self._trail.clear()
-        self._trail.append(self._single.body[:3])
+        self._trail.append(self._environment.states[0, :3])
         return observation, {}
 
     def step(self, action: Any) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
@@ -108,14 +113,15 @@ class HoverEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         if self._state != "flying":
             when = "after the end of an episode" if self._state == "ended" else "before the first reset"
             raise gymnasium.error.ResetNeeded(f"step() was called {when}. Call reset() first.")
-        moment = self._single.step(read_action(action, (4,)), self._noise())
-        terminated = moment.cause != SAFE
-        self._steps, self._reward = self._steps + 1, moment.reward
-        self._trail.append(moment.body[:3])
-        if terminated or moment.truncated:
+        moved = self._environment.step(read_action(action, (4,))[None], self._noise())
+        terminated, truncated = bool(moved.terminated[0]), bool(moved.truncated[0])
+        self._steps, self._reward = self._steps + 1, float(moved.reward[0])
+        self._trail.append(moved.states[0, :3])
+        if terminated or truncated:
             self._state = "ended"
-        info = {"reward_terms": moment.terms, "termination": self._causes[moment.cause] if terminated else None}
-        return moment.observation, moment.reward, terminated, moment.truncated, info
+        terms = {name: float(reward[0]) for name, reward in moved.terms.items()}
+        info = {"reward_terms": terms, "termination": self._causes[moved.cause[0]] if terminated else None}
+        return moved.observation[0], self._reward, terminated, truncated, info
 
     def render(self) -> np.ndarray | None:  # pyright: ignore[reportIncompatibleMethodOverride]
         """A picture [480, 480, 3] of the present state, or None without a render mode.
@@ -128,11 +134,17 @@ class HoverEnv(gymnasium.Env[np.ndarray, np.ndarray]):
             return None
         if self._state == "made":
             raise gymnasium.error.ResetNeeded("render() was called before the first reset. Call reset() first.")
-        return take_picture(self.task, self._single.body, np.array(self._trail), self._steps, self._reward)
+        return take_picture(self.task, self._environment.states[0], np.array(self._trail), self._steps, self._reward)
 
     def close(self) -> None:
-        """Give the world's memory back."""
-        self._single.close()
+        """Give the simulator's memory back."""
+        self._environment.close()
+
+    def _at(self, position: Any, yaw: float) -> Any:
+        """The episode that begins level and at rest at a position in m and a yaw in rad."""
+        about_z = from_euler(*map(jnp.float32, (0.0, 0.0, yaw)))
+        states = state_numbers(hovering(self.task.vehicle, tuple(position), about_z))
+        return episodes_at(self.task, states[:, None])
 
     def _noise(self) -> np.ndarray:
-        return self.np_random.standard_normal(NOISY, dtype=np.float32)
+        return self.np_random.standard_normal((NOISY, 1), dtype=np.float32)

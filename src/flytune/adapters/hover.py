@@ -5,11 +5,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from flytune.adapters.single import parts
 from flytune.errors import BadInput
 from flytune.extras import require
 from flytune.physics.dynamics import CONTROL_PERIOD
 from flytune.physics.rotors import places
+from flytune.simulation.simulator import VehicleStates
 from flytune.task.observation import SIZE
 from flytune.task.situation import POSITION_BAND
 from flytune.task.task import Task, load_task
@@ -130,13 +130,13 @@ def take_picture(task: Task, body: np.ndarray, trail: np.ndarray, steps: int, re
     """The picture of a body's 17 numbers, with the way it came."""
     from flytune.adapters import picture  # here, because it needs Pillow
 
-    part = parts(np.nan_to_num(body).astype(float))
+    now = VehicleStates.from_rows(np.nan_to_num(body).astype(float))
     target = np.array(task.target.position, float)
-    distance, speed = np.linalg.norm(body[:3] - target), np.linalg.norm(part["velocity"])
+    distance, speed = np.linalg.norm(body[:3] - target), np.linalg.norm(now.velocity)
     scene = picture.Scene(
-        position=part["position"],
-        attitude=part["attitude"],
-        thrust=(part["rotor_speed_rpm"] / task.vehicle.hover_rotor_speed_rpm) ** 2,
+        position=now.position,
+        attitude=now.attitude,
+        thrust=(now.rotor_speed_rpm / task.vehicle.hover_rotor_speed_rpm) ** 2,
         rotors=places(task.vehicle),
         propeller_radius=float(task.vehicle.propeller_radius),
         target=target,

@@ -1,4 +1,4 @@
-"""Our batch of episodes as a vector environment of Stable-Baselines3: one compiled call steps all of them."""
+"""flytune's environment as a vector environment of Stable-Baselines3: one compiled call steps all episodes."""
 
 # pyright: reportMissingImports=false
 # PyTorch is in no pinned requirement; without it the rest is checked all the same
@@ -9,8 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from flytune.adapters.batch import Batch, Transition
 from flytune.extras import require
+from flytune.simulation.host import HostEnvironment, Transition
+from flytune.simulation.simulators import make_simulator
 from flytune.task.observation import SIZE
 from flytune.task.task import Task
 from flytune.task.termination import causes
@@ -35,13 +36,16 @@ class HoverVecEnv(VecEnv):
     Args:
         task: what is flown.
         number: how many environments.
-        seed: of starts and noise, until `seed` and `reset` are called.
+        seed: of initial states and noise, until `seed` and `reset` are called.
+        simulator: "flytune", "pybullet" or "mujoco".
     """
 
     transition: Transition | None = None
 
-    def __init__(self, task: Task, number: int, seed: int = 0) -> None:
-        self.task, self.batch = task, Batch(task, number, seed)
+    def __init__(self, task: Task, number: int, seed: int = 0, simulator: str = "flytune") -> None:
+        self.task = task
+        self.environment = HostEnvironment(task, make_simulator(simulator, task.vehicle, number), number)
+        self.environment.reset(seed)
         self.render_mode: str | None = None  # the base class asks for it before it sets it
         self._names = causes(task.termination)
         self._own: list[dict[str, Any]] = [{} for _ in range(number)]
@@ -57,7 +61,7 @@ class HoverVecEnv(VecEnv):
         seed = self._seeds[0]
         self._reset_seeds()
         self._reset_options()
-        return self.batch.reset(None if seed is None else seed % 2**32)
+        return self.environment.reset(None if seed is None else seed % 2**32)
 
     def step_async(self, actions: np.ndarray) -> None:
         """Take the actions [N, 4] of the next step.
@@ -74,7 +78,7 @@ class HoverVecEnv(VecEnv):
 
     def step_wait(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[dict[str, Any]]]:
         """Observations [N, 17], rewards [N], whether an episode ended [N], and N infos."""
-        self.transition = now = self.batch.step(self._action)
+        self.transition = now = self.environment.step(self._action)
         infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
         for index in np.flatnonzero(now.ended):
             failed = bool(now.terminated[index])
@@ -92,7 +96,8 @@ class HoverVecEnv(VecEnv):
         return now.observation, now.reward.copy(), now.ended, infos
 
     def close(self) -> None:
-        """Nothing: there are no processes and no windows."""
+        """Give the simulator's memory back."""
+        self.environment.close()
 
     def get_attr(self, attr_name: str, indices: Indices = None) -> list[Any]:
         """An attribute of each environment: what `set_attr` gave it, else that of the whole."""

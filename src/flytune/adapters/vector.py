@@ -6,7 +6,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from flytune.adapters.batch import Batch, Transition
 from flytune.adapters.hover import (
     METADATA,
     TRAIL,
@@ -19,6 +18,8 @@ from flytune.adapters.hover import (
 )
 from flytune.errors import BadInput
 from flytune.extras import require
+from flytune.simulation.host import HostEnvironment, Transition
+from flytune.simulation.simulators import make_simulator
 from flytune.task.task import Task
 from flytune.task.termination import causes
 
@@ -40,6 +41,8 @@ class HoverVectorEnv(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarr
         num_envs: how many.
         task: a preset, a .toml file, or a Task.
         edits: field path -> value, applied to a preset or file.
+        simulator: "flytune", "pybullet" or "mujoco".
+        simulator_options: of that simulator, see `make_simulator`.
         render_mode: None, or "rgb_array".
 
     Raises:
@@ -53,6 +56,8 @@ class HoverVectorEnv(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarr
         num_envs: int = 1,
         task: str | Path | Task = "baseline",
         edits: dict[str, Any] | None = None,
+        simulator: str = "flytune",
+        simulator_options: dict[str, Any] | None = None,
         render_mode: str | None = None,
     ) -> None:
         if num_envs < 1:
@@ -60,10 +65,12 @@ class HoverVectorEnv(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarr
         self.task = read_task(task, edits)
         self.render_mode = read_render_mode(render_mode)
         self.num_envs = num_envs
+        self._simulator, self._simulator_options = simulator, simulator_options
+        make_simulator(simulator, self.task.vehicle, 1, simulator_options).close()  # an unknown one is refused now
         self.single_observation_space, self.single_action_space = make_spaces()
         self.observation_space = gymnasium.vector.utils.batch_space(self.single_observation_space, num_envs)
         self.action_space = gymnasium.vector.utils.batch_space(self.single_action_space, num_envs)
-        self._batch: Batch | None = None  # until the first reset, which brings the seed
+        self._environment: HostEnvironment | None = None  # until the first reset, which brings the seed
         self._names = np.array([*causes(self.task.termination), None], dtype=object)  # the last, -1, is SAFE
         self._trail: deque[np.ndarray] = deque(maxlen=TRAIL)
         self._reward = np.zeros(num_envs)
@@ -82,14 +89,15 @@ class HoverVectorEnv(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarr
         """
         super().reset(seed=seed)
         mask = read_mask(options, self.num_envs)
-        if self._batch is None:
+        if self._environment is None:
             if mask is not None:
                 raise gymnasium.error.ResetNeeded("reset() with a mask was called before the first full reset.")
-            self._batch = Batch(self.task, self.num_envs, int(self.np_random.integers(2**32)))
-            observation = self._batch.observation
+            simulator = make_simulator(self._simulator, self.task.vehicle, self.num_envs, self._simulator_options)
+            self._environment = HostEnvironment(self.task, simulator, self.num_envs)
+            observation = self._environment.reset(int(self.np_random.integers(2**32)))
         else:
             anew = None if seed is None else int(self.np_random.integers(2**32))
-            observation = self._batch.reset(anew, mask)
+            observation = self._environment.reset(anew, mask)
         self._reward = np.where(True if mask is None else mask, 0.0, self._reward)
         self._follow()
         return observation, {}
@@ -101,9 +109,9 @@ class HoverVectorEnv(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarr
             ResetNeeded: before the first reset.
             InvalidAction: not four finite numbers for each environment.
         """
-        if self._batch is None:
+        if self._environment is None:
             raise gymnasium.error.ResetNeeded("step() was called before the first reset. Call reset() first.")
-        moved = self._batch.step(read_action(actions, (self.num_envs, 4)))
+        moved = self._environment.step(read_action(actions, (self.num_envs, 4)))
         self._reward = np.where(moved.ended, 0.0, moved.reward)
         self._follow()
         return moved.observation, moved.reward, moved.terminated, moved.truncated, self._infos(moved)
@@ -117,19 +125,23 @@ class HoverVectorEnv(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarr
         if self.render_mode is None:
             gymnasium.logger.warn('render() needs render_mode="rgb_array", given to gymnasium.make_vec.')
             return None
-        if self._batch is None:
+        if self._environment is None:
             raise gymnasium.error.ResetNeeded("render() was called before the first reset. Call reset() first.")
-        steps = np.asarray(self._batch.episodes.steps)
-        bodies, trail = self._batch.bodies(), np.array(self._trail)
+        steps, bodies, trail = self._environment.steps(), self._environment.states, np.array(self._trail)
         return tuple(
             take_picture(self.task, body, trail[-(count + 1) :, index], int(count), float(reward))
             for index, (body, count, reward) in enumerate(zip(bodies, steps, self._reward, strict=True))
         )
 
+    def close_extras(self, **kwargs: Any) -> None:
+        """Give the simulator's memory back."""
+        if self._environment is not None:
+            self._environment.close()
+
     def _follow(self) -> None:
         """Remember where the vehicles are, if somebody may want to see it."""
-        if self.render_mode is not None and self._batch is not None:
-            self._trail.append(self._batch.bodies()[:, :3])
+        if self.render_mode is not None and self._environment is not None:
+            self._trail.append(self._environment.states[:, :3])
 
     def _infos(self, moved: Transition) -> dict[str, Any]:
         """The infos as Gymnasium's own vector environments give them: arrays, each with its mask `_name`."""

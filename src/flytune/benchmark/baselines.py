@@ -258,7 +258,7 @@ def _alone(task: Task) -> Iterator[Repeat]:
     def run() -> None:
         for action in actions:
             simulator.advance(action)
-            simulator.body()
+            simulator.states()
 
     yield run
     simulator.close()

@@ -11,7 +11,8 @@ import jax
 import jax.numpy as jnp
 
 from flytune.benchmark.baselines import Row, compare_simulation, compare_training
-from flytune.simulation import environment
+from flytune.simulation.environment import Episode
+from flytune.simulation.rollout import Draw, reset_all, rollout
 from flytune.task.observation import NOISY
 from flytune.task.task import Task, load_task
 from flytune.task.training_settings import PpoSettings
@@ -137,20 +138,19 @@ def _training(trainer: Trainer, task: Task) -> Callable[[], Any]:
 def _simulation(task: Task) -> Callable[[], Any]:
     """A flight of many episodes in one compiled call."""
     environments, steps = SIMULATED
-    keys = jax.random.split(jax.random.key(0), environments)
-    episodes = jax.vmap(lambda key: environment.reset(task, key), out_axes=-1)(keys)
+    episodes = reset_all(task, jax.random.split(jax.random.key(0), environments))
 
-    def one_step(episode: environment.Episode, normal: jax.Array, key: jax.Array) -> Any:
-        seen = environment.look(task, episode, normal)
-        moved, outcome = environment.step(task, episode, 0.1 * seen[:4])
-        return environment.autoreset(task, moved, outcome, key), outcome.reward
+    def decide(memory: Any, observation: jax.Array, draw: Any, episodes: Episode) -> Any:
+        return memory, 0.1 * observation[:, :4], ()
 
     @jax.jit
-    def fly(episodes: environment.Episode, key: jax.Array) -> Any:
+    def fly(episodes: Episode, key: jax.Array) -> Any:
         noise_key, reset_key = jax.random.split(key)
-        normal = jax.random.normal(noise_key, (steps, NOISY, environments))
-        keys = jax.random.split(reset_key, (steps, environments))
-        batch = jax.vmap(one_step, in_axes=-1, out_axes=-1)
-        return jax.lax.scan(lambda carry, now: batch(carry, *now), episodes, (normal, keys))[1].mean()
+        draws = Draw(
+            noise=jax.random.normal(noise_key, (steps, NOISY, environments)),
+            keys=jax.random.split(reset_key, (steps, environments)),
+        )
+        record = rollout(task, decide, (episodes, ()), draws, record=lambda after, moved, outcome: outcome.reward)[1]
+        return record.record.mean()
 
     return lambda: jax.block_until_ready(fly(episodes, jnp.asarray(jax.random.key(1))))

@@ -9,8 +9,6 @@ import numpy as np
 
 from flytune.config.files import write_bytes
 
-CRASH_DISTANCE = 10.0  # m from the target; a vehicle beyond it has crashed
-
 STATE_COLUMNS = {
     "position": ("x", "y", "z"),
     "attitude": ("qx", "qy", "qz", "qw"),

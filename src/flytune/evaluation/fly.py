@@ -1,24 +1,29 @@
-"""Flying: a controller, a task and a set of starts become recorded flights."""
+"""Flying: a controller, a task and initial conditions become recorded flights, in any simulator."""
 
-from collections.abc import Mapping
+import dataclasses
+from collections.abc import Callable, Mapping
 from functools import partial
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from flytune.control.controller import Controller
-from flytune.errors import BadInput
+from flytune.errors import BadInput, Diverged
 from flytune.evaluation.flights import Flights
-from flytune.evaluation.lockstep import fly_in_simulator
-from flytune.evaluation.trial import begin, decide, is_lost, margins_along, not_finite, trial_keys
-from flytune.physics import dynamics
-from flytune.physics.dynamics import CONTROL_PERIOD, State
+from flytune.physics.dynamics import CONTROL_PERIOD
+from flytune.physics.vehicle import Vehicle
+from flytune.simulation.environment import Episode, Outcome, begin, hold, is_crashed, margins_along
+from flytune.simulation.host import HostEnvironment, ravel
+from flytune.simulation.rollout import Draw, rollout
+from flytune.simulation.simulator import WIDTHS, Simulator, VehicleStates, state_from, state_numbers
 from flytune.simulation.simulators import make_simulator
 from flytune.task.initial_state import EVALUATION_INITIAL_STATES, InitialState
+from flytune.task.observation import SIZE, draw_noise
 from flytune.task.task import Task
 
+ACTION = slice(SIZE - 4, SIZE)  # of an observation: the last action, which carries no noise
 InitialConditions = Literal["clear", "paper"]
 
 
@@ -31,30 +36,31 @@ def fly(
     initial_conditions: InitialConditions = "clear",
     duration: float | None = None,
     name: str = "",
-    simulator: str = "flytune",
+    simulator: str | Callable[[Vehicle, int], Simulator] = "flytune",
     simulator_options: Mapping[str, Any] | None = None,
 ) -> Flights:
     """The trajectories of a controller over many trials, from rest, on noisy observations (paper R19).
 
-    Start and noise of a trial depend on (seed, trial, step) alone, so controllers, and worlds, can be compared on
-    equal terms.
-    Trials run to their end whether or not a termination is crossed.
+    The initial state and the noise of a trial depend on (seed, trial, step) alone, so that controllers and simulators
+    can be compared on equal terms. Trials run to their end whether or not a termination is crossed.
 
     Args:
-        controller: the controller.
+        controller: what decides, or what `find_controller` found.
         task: what it is asked to do, and with which vehicle.
         trials: how many, 1 or more.
-        seed: of starts and noise.
-        starts: `clear` (z0 >= 0.1 m) or `paper` (exactly as printed).
+        seed: of initial states and noise.
+        initial_conditions: `clear` (z0 >= 0.1 m) or `paper` (exactly as printed).
         duration: of a trial in s, more than 0.5; the task's own where None.
-        who: the controller's name, for the record.
-        world: the simulator, one of `flytune`, `pybullet`, `mujoco`.
-        world_options: of that simulator, see `make_world`.
+        name: the controller's name, for the record.
+        simulator: one of `flytune`, `pybullet`, `mujoco`; or what makes one of your own, from a vehicle and a number.
+        simulator_options: of that simulator, see `make_simulator`.
 
     Raises:
         BadInput: an argument out of range, or a simulator that is not installed.
         Diverged: the controller answered a finite observation with an action that is not finite.
     """
+    if hasattr(controller, "controller"):  # found by name: it knows what it is called
+        controller, name = controller.controller, name or controller.name
     duration = task.duration if duration is None else duration
     if not 1 <= trials <= 100_000:
         raise BadInput(f"trials: {trials} is not allowed. Allowed: a whole number, 1 to 100000.")
@@ -67,26 +73,24 @@ def fly(
     if not 0 <= seed < 2**32:
         raise BadInput(f"seed: {seed} is not allowed. Allowed: a whole number, 0 to {2**32 - 1}.")
     steps = round(duration / CONTROL_PERIOD)
-    drawn, keys = EVALUATION_INITIAL_STATES[initial_conditions], trial_keys(seed, trials)
-    if simulator == "flytune" and not simulator_options:
-        record = _fly_at_once(controller, task, drawn, keys, steps, name)
+    keys = trial_keys(seed, trials)
+    starts, noise_keys = _begin(task, EVALUATION_INITIAL_STATES[initial_conditions], keys)
+    if isinstance(simulator, str):
+        flown_in = make_simulator(simulator, task.vehicle, trials, simulator_options)
     else:
-        elsewhere = make_simulator(simulator, task.vehicle, trials, simulator_options)
-        try:
-            record = fly_in_simulator(elsewhere, controller, task, drawn, keys, steps, name)
-        finally:
-            elsewhere.close()
-    states, actions, left, crashed = jax.tree.map(np.asarray, record)
+        flown_in, simulator = simulator(task.vehicle, trials), getattr(simulator, "__name__", "custom")
+    try:
+        record = rollout_trials(flown_in, controller, task, starts, noise_keys, steps, name)
+    finally:
+        flown_in.close()
+    states, actions = np.asarray(record.states), np.asarray(record.actions)
+    along = VehicleStates.from_rows(np.ascontiguousarray(states.transpose(2, 0, 1)))
     return Flights(
         time=np.arange(steps + 1) * CONTROL_PERIOD,
-        position=np.stack(states.position, axis=-1),
-        attitude=np.stack(states.attitude, axis=-1),
-        velocity=np.stack(states.velocity, axis=-1),
-        body_rate=np.stack(states.body_rate, axis=-1),
-        rotor_speed_rpm=np.stack(states.rotor_speed_rpm, axis=-1),
-        action=actions,
-        crashed=crashed,
-        margins=left,
+        **{field: getattr(along, field) for field in WIDTHS},
+        action=np.ascontiguousarray(actions.transpose(2, 0, 1)),
+        crashed=np.asarray(record.crashed),
+        margins={name: np.asarray(margin) for name, margin in _margins(task, states, actions).items()},
         target_position=np.asarray(task.target.position),
         target_yaw=float(task.target.yaw),
         speed_bound=task.speed_bound,
@@ -99,37 +103,151 @@ def fly(
     )
 
 
-def _fly_at_once(
-    controller: Any, task: Task, initial_conditions: InitialState, keys: jax.Array, steps: int, name: str
-) -> tuple[State, Any, dict[str, Any], Any]:
-    """The same as `fly_in_world`, in flytune's own world: one compiled program."""
-    *record, given, finite = _fly_all(controller, task, initial_conditions, keys, steps)
+class Record(NamedTuple):
+    """Trajectories of N trials at samples 0 to T; a crashed trial holds its last sample."""
+
+    states: Any  # [T + 1, 17, N]
+    actions: Any  # [T + 1, 4, N], clipped; sample 0 is hover
+    crashed: Any  # [N] bool
+
+
+def rollout_trials(
+    simulator: Simulator, controller: Any, task: Task, starts: Any, noise_keys: Any, steps: int, name: str
+) -> Record:
+    """The trajectories of trials that begin in states [17, N]: as one compiled loop where the simulator allows it.
+
+    Raises:
+        Diverged: the controller answered a finite observation with an action that is not finite.
+    """
+    flown = (controller, task, starts, noise_keys, steps)
+    if simulator.physics is None:
+        return _rollout_on_host(simulator, *flown, name)
+    record, given, finite = _rollout_on_device(simulator.physics, *flown)
     if not np.all(finite):
-        trial, step = np.argwhere(~np.asarray(finite))[0]
-        raise not_finite(name, given[trial, step], trial, step)
-    return tuple(record)
+        trial, step = np.argwhere(~np.asarray(finite).T)[0]
+        raise _not_finite(name, given[step, trial], trial, step)
+    return record
 
 
-@partial(jax.jit, static_argnames="steps")
-def _fly_all(controller: Any, task: Task, initial_conditions: InitialState, keys: jax.Array, steps: int) -> Any:
-    return jax.vmap(lambda key: _fly_one(controller, task, initial_conditions, key, steps))(keys)
+def _rollout_on_host(
+    simulator: Simulator, controller: Any, task: Task, starts: Any, noise_keys: Any, steps: int, name: str
+) -> Record:
+    """The same where controller and simulator take turns."""
+    trials = len(noise_keys)
+    controller, task = jax.device_put((controller, task))  # once, not at every step
+    environment = HostEnvironment(task, simulator, trials, ending="hold")
+    seen = environment.start(_episodes(task, starts), _noise(noise_keys, 0))
+    memory = _initial_memory(controller, trials)
+    states, actions = [environment.states.T], [seen[:, ACTION].T]
+    crashed = np.zeros(trials, bool)
+    for index in range(steps):
+        memory, action, given, finite = _decide(controller, memory, seen)
+        if not np.all(finite):
+            trial = int(np.argmin(finite))
+            raise _not_finite(name, given[trial], trial, index)
+        moved = environment.step(np.asarray(action), _noise(noise_keys, index + 1))
+        seen, crashed = moved.observation, moved.crashed
+        states.append(moved.states.T)
+        actions.append(seen[:, ACTION].T)
+    return Record(np.stack(states), np.stack(actions), crashed)
 
 
-def _fly_one(controller: Any, task: Task, initial_conditions: InitialState, key: jax.Array, steps: int) -> Any:
-    """States, actions, margins at samples 0 to `steps`; crashed or not; the actions as given, and which were finite."""
-    start, noise_key = begin(task, initial_conditions, key)
-    rest = jnp.zeros(4)
+def trial_keys(seed: int, trials: int) -> jax.Array:
+    """The random key of each trial, from the seed and the trial's number alone."""
+    return jax.vmap(partial(jax.random.fold_in, jax.random.key(seed)))(jnp.arange(trials))
 
-    def advance(carry: Any, index: jax.Array) -> Any:
-        state, last_action, memory, crashed = carry
-        memory, action, given, finite = decide(controller, task, noise_key, index, state, last_action, memory)
-        moved = dynamics.step(task.vehicle, state, action)
-        crashed = crashed | is_lost(task, moved)
-        kept = jax.tree.map(lambda new, old: jnp.where(crashed, old, new), (moved, action), (state, last_action))
-        return (*kept, memory, crashed), (*kept, given, finite)
 
-    carry = (start, rest, controller.initial_memory(), is_lost(task, start))
-    (_, _, _, crashed), (states, actions, given, finite) = jax.lax.scan(advance, carry, jnp.arange(steps))
-    states = jax.tree.map(lambda first, later: jnp.concatenate([first[None], later]), start, states)
-    actions = jnp.concatenate([rest[None], actions])
-    return states, actions, margins_along(task, states, actions), crashed, given, finite
+@jax.jit
+def _begin(task: Task, initial_state: InitialState, keys: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """The states [17, N] in which trials begin, and the keys of their noise."""
+
+    def one(key: jax.Array) -> tuple[jax.Array, jax.Array]:
+        start_key, noise_key = jax.random.split(key)
+        return state_numbers(initial_state.draw(task.vehicle, start_key)), noise_key
+
+    return jax.vmap(one, out_axes=(-1, 0))(keys)
+
+
+@jax.jit
+def _episodes(task: Task, starts: jax.Array) -> jax.Array:
+    """The episodes [K, N] that begin in states [17, N]; one that begins crashed is held from the start."""
+    return ravel(_started(task, starts))
+
+
+def _started(task: Task, starts: jax.Array) -> Episode:
+    def one(numbers: jax.Array) -> Episode:
+        state = state_from(numbers, jnp.zeros((task.vehicle.action_latency_steps, 4)))
+        crashed = is_crashed(task, state)
+        episode = begin(state)
+        return dataclasses.replace(episode, steps=jnp.where(crashed, -1, episode.steps))
+
+    return jax.vmap(one, in_axes=-1, out_axes=-1)(starts)
+
+
+@partial(jax.jit, static_argnums=(0, 5))
+def _rollout_on_device(
+    physics: Any, controller: Any, task: Task, starts: jax.Array, noise_keys: jax.Array, steps: int
+) -> tuple[Record, jax.Array, jax.Array]:
+    """The record, the actions as given [T, N, 4], and which of them are finite [T, N]."""
+
+    def decide(memory: Any, seen: jax.Array, drawn: Any, episodes: Episode) -> Any:
+        memory, action, given, finite = _decide(controller, memory, seen)
+        return memory, action, (given, finite)
+
+    def keep(after: Episode, moved: Episode, outcome: Outcome) -> tuple[jax.Array, jax.Array]:
+        return state_numbers(after.state), after.last_action
+
+    episodes = _started(task, starts)
+    (episodes, _), step = rollout(
+        task,
+        decide,
+        (episodes, _initial_memory(controller, starts.shape[-1])),
+        jnp.arange(steps),
+        ending=hold,
+        record=keep,
+        draw=lambda index: Draw(noise=_noise(noise_keys, index)),
+        physics=physics,
+    )
+    states, actions = (jnp.concatenate([first[None], later]) for first, later in
+                       zip((starts, episodes.last_action * 0), step.record, strict=True))  # fmt: skip
+    return Record(states, actions, episodes.steps < 0), *step.notes
+
+
+@jax.jit
+def _noise(keys: jax.Array, index: Any) -> jax.Array:
+    """The noise [13, N] of every trial's observation at sample `index`."""
+    return jax.vmap(lambda key: draw_noise(jax.random.fold_in(key, index)), out_axes=-1)(keys)
+
+
+def _initial_memory(controller: Any, trials: int) -> Any:
+    return jax.tree.map(lambda part: jnp.broadcast_to(part, (trials, *jnp.shape(part))), controller.initial_memory())
+
+
+@jax.jit
+def _decide(controller: Any, memory: Any, seen: jax.Array) -> tuple[Any, jax.Array, jax.Array, jax.Array]:
+    """The controller's memory, actions clipped [N, 4], actions as given, and which of them are finite [N].
+
+    An action that is not finite counts against the controller only where its observation is finite.
+    """
+    memory, given = jax.vmap(controller.act)(memory, seen)
+    finite = jnp.all(jnp.isfinite(given), axis=-1) | ~jnp.all(jnp.isfinite(seen), axis=-1)
+    return memory, jnp.clip(given, -1.0, 1.0), given, finite
+
+
+@jax.jit
+def _margins(task: Task, states: jax.Array, actions: jax.Array) -> dict[str, jax.Array]:
+    """The margins [N, T + 1] of states [T + 1, 17, N] under actions [T + 1, 4, N]."""
+
+    def one(numbers: jax.Array, actions: jax.Array) -> dict[str, jax.Array]:
+        none_pending = jnp.zeros((len(actions), task.vehicle.action_latency_steps, 4))
+        return margins_along(task, state_from(numbers.T, none_pending), actions)
+
+    return jax.vmap(one, in_axes=-1)(states, actions)
+
+
+def _not_finite(name: str, action: Any, trial: int, step: int) -> Diverged:
+    """The error of a controller whose action is not finite."""
+    return Diverged(
+        f"{name or 'controller'}: action {action} is not finite in trial {trial} "
+        f"at {step * CONTROL_PERIOD:.2f} s, on a finite observation."
+    )

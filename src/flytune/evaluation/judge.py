@@ -7,9 +7,10 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from flytune.evaluation import lower_bounds, metrics
-from flytune.evaluation.flights import CRASH_DISTANCE, Flights
+from flytune.evaluation.flights import Flights
 from flytune.evaluation.statistics import finite, median, summary
 from flytune.evaluation.table import AXES, response_line, response_text
+from flytune.simulation import CRASH_DISTANCE
 
 CHANNELS = (*AXES, "position")
 SECONDARY_BANDS = {"2%": 0.02, "5%": 0.05}  # of each trial's own step

@@ -1,6 +1,6 @@
-"""flytune's own simulator as a world like any other: to fly side by side with the others, and to test what flies."""
+"""flytune's own simulator: its step in JAX for the rollout on the device, and the same step for a loop on the host."""
 
-from functools import partial
+from functools import lru_cache, partial
 from typing import Annotated
 
 import jax
@@ -13,12 +13,13 @@ from flytune.config.pytree import pytree, static
 from flytune.physics import dynamics
 from flytune.physics.dynamics import PHYSICS_STEPS, State
 from flytune.physics.vehicle import Vehicle
-from flytune.simulation.simulator import VehicleStates
+from flytune.simulation.environment import Physics
+from flytune.simulation.simulator import VehicleStates, state_from, state_numbers
 
 
 @pytree
 class JaxSimulatorOptions:
-    """How finely flytune's own physics is stepped."""
+    """How finely the physics is stepped."""
 
     physics_steps: Annotated[Whole, Ge(1), Le(100), Unit("per control period")] = static(default=PHYSICS_STEPS)
 
@@ -26,61 +27,46 @@ class JaxSimulatorOptions:
 class JaxSimulator:
     """N vehicles under `physics.dynamics`, in float32."""
 
-    def __init__(self, vehicle: Vehicle, number: int, options: JaxSimulatorOptions) -> None:
-        self._vehicle = vehicle
-        self._physics_steps = options.physics_steps
-        hovering = dynamics.hovering(vehicle, (0.0, 0.0, 0.0))
-        self._state = jax.tree.map(lambda part: np.repeat(np.asarray(part)[None], number, axis=0), hovering)
+    physics: Physics | None
 
-    def place(self, body: VehicleStates, which: np.ndarray | None = None) -> None:
-        """Put the vehicles there, see `World`."""
+    def __init__(self, vehicle: Vehicle, number: int, options: JaxSimulatorOptions | None = None) -> None:
+        self.physics = self._step = _physics((options or JaxSimulatorOptions()).physics_steps)
+        self._vehicle, self._latency = vehicle, vehicle.action_latency_steps
+        hovering = np.asarray(state_numbers(dynamics.hovering(vehicle, (0.0, 0.0, 0.0))))
+        self._numbers = np.repeat(hovering[:, None], number, axis=1)
+        self._pending = np.zeros((self._latency, 4, number), np.float32)
+
+    def place(self, states: VehicleStates, which: np.ndarray | None = None) -> None:
+        """Put the vehicles there, see `Simulator`."""
         chosen = slice(None) if which is None else which
-        placed = State(
-            position=_components(body.position),
-            attitude=_components(body.attitude),
-            velocity=_components(body.velocity),
-            body_rate=_components(body.body_rate),
-            rotor_speed_rpm=_components(body.rotor_speed_rpm),
-            pending_actions=jnp.zeros((len(body.position), self._vehicle.action_latency_steps, 4)),
-        )
-
-        def put(old: np.ndarray, new: np.ndarray) -> np.ndarray:
-            result = np.array(old)
-            result[chosen] = new
-            return result
-
-        self._state = jax.tree.map(put, self._state, placed)
+        self._numbers, self._pending = np.array(self._numbers), np.array(self._pending)
+        self._numbers[:, chosen] = states.rows().T
+        self._pending[..., chosen] = 0.0
 
     def advance(self, action: np.ndarray) -> None:
-        """Let one control period pass, see `World`."""
-        self._state = _advance(self._vehicle, self._state, jnp.asarray(action, jnp.float32), self._physics_steps)
+        """Let one control period pass, see `Simulator`."""
+        given = np.asarray(action, np.float32).T
+        self._numbers, self._pending = _advance(self._step, self._vehicle, self._numbers, self._pending, given)
 
-    def body(self) -> VehicleStates:
-        """Where the vehicles are, see `World`."""
-        state = self._state
-        parts = (state.position, state.attitude, state.velocity, state.body_rate, state.rotor_speed_rpm)
-        position, attitude, velocity, body_rate, rotor_speed = (
-            np.stack([np.asarray(component, float) for component in part], axis=-1) for part in parts
-        )
-        return VehicleStates(
-            position=position,
-            attitude=attitude,
-            velocity=velocity,
-            body_rate=body_rate,
-            rotor_speed_rpm=rotor_speed,
-        )
+    def states(self) -> VehicleStates:
+        """The states of the vehicles now, see `Simulator`."""
+        return VehicleStates.from_rows(np.asarray(self._numbers, float).T)
 
     def close(self) -> None:
         """Nothing to give back."""
 
 
-def _components(array: np.ndarray) -> tuple[np.ndarray, ...]:
-    return tuple(np.asarray(array, np.float32).T)
+@lru_cache  # the same function for the same number, so that one compiled program serves every simulator
+def _physics(physics_steps: int) -> Physics:
+    return dynamics.step if physics_steps == PHYSICS_STEPS else partial(dynamics.step, physics_steps=physics_steps)
 
 
-@partial(jax.jit, static_argnames="physics_steps")
-def _advance(vehicle: Vehicle, state: State, action: jax.Array, physics_steps: int) -> State:
+@partial(jax.jit, static_argnums=0)
+def _advance(
+    physics: Physics, vehicle: Vehicle, numbers: jax.Array, pending: jax.Array, action: jax.Array
+) -> tuple[jax.Array, jax.Array]:
     def one(state: State, action: jax.Array) -> State:
-        return dynamics.step(vehicle, state, jnp.clip(action, -1.0, 1.0), physics_steps)
+        return physics(vehicle, state, jnp.clip(action, -1.0, 1.0))
 
-    return jax.vmap(one)(state, action)
+    moved = jax.vmap(one, in_axes=-1, out_axes=-1)(state_from(numbers, pending), action)
+    return state_numbers(moved), moved.pending_actions

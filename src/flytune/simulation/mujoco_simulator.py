@@ -35,6 +35,8 @@ class MujocoSimulator:
     drag is set as damping on the three directions of the joint, so that MuJoCo's integrators know of it.
     """
 
+    physics = None
+
     def __init__(self, vehicle: Vehicle, number: int, options: MujocoOptions) -> None:
         """The compiled model, and the vehicles at its origin.
 
@@ -52,14 +54,14 @@ class MujocoSimulator:
         self._state = np.zeros((number, mujoco.mj_stateSize(self._model, mujoco.mjtState.mjSTATE_FULLPHYSICS)))
         self._state[:, ATTITUDE] = 1.0, 0.0, 0.0, 0.0
 
-    def place(self, body: VehicleStates, which: np.ndarray | None = None) -> None:
+    def place(self, states: VehicleStates, which: np.ndarray | None = None) -> None:
         """Put the vehicles there, see `World`."""
         chosen = slice(None) if which is None else which
-        self._state[chosen, POSITION] = body.position
-        self._state[chosen, ATTITUDE] = body.attitude[:, W_FIRST]
-        self._state[chosen, VELOCITY] = body.velocity
-        self._state[chosen, BODY_RATE] = body.body_rate
-        self._actuator.place(body.rotor_speed_rpm, which)
+        self._state[chosen, POSITION] = states.position
+        self._state[chosen, ATTITUDE] = states.attitude[:, W_FIRST]
+        self._state[chosen, VELOCITY] = states.velocity
+        self._state[chosen, BODY_RATE] = states.body_rate
+        self._actuator.place(states.rotor_speed_rpm, which)
 
     def advance(self, action: np.ndarray) -> None:
         """Let one control period pass, see `World`."""
@@ -70,7 +72,7 @@ class MujocoSimulator:
         states, _ = self._rollout.rollout(self._model, self._data, self._state, controls)
         self._state = np.array(states[:, -1])
 
-    def body(self) -> VehicleStates:
+    def states(self) -> VehicleStates:
         """Where the vehicles are, see `World`."""
         state = self._state
         return VehicleStates(

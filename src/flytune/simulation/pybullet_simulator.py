@@ -41,6 +41,8 @@ class PyBulletSimulator:
     them (semi-implicit Euler, first order), and forgets forces after each step. docs/results/worlds.md measures all of these.
     """
 
+    physics = None
+
     def __init__(self, vehicle: Vehicle, number: int, options: PyBulletOptions) -> None:
         """An open client with the vehicles in it, all at the origin.
 
@@ -79,19 +81,19 @@ class PyBulletSimulator:
             )
         return vehicles
 
-    def place(self, body: VehicleStates, which: np.ndarray | None = None) -> None:
+    def place(self, states: VehicleStates, which: np.ndarray | None = None) -> None:
         """Put the vehicles there, see `World`."""
         chosen = range(len(self._vehicles)) if which is None else which
-        turning = to_inertial(np.asarray(body.attitude, float), np.asarray(body.body_rate, float))
+        turning = to_inertial(np.asarray(states.attitude, float), np.asarray(states.body_rate, float))
         for row, index in enumerate(chosen):
             vehicle = self._vehicles[int(index)]
             self._bullet.resetBasePositionAndOrientation(
-                vehicle, body.position[row].tolist(), body.attitude[row].tolist(), physicsClientId=self._client
+                vehicle, states.position[row].tolist(), states.attitude[row].tolist(), physicsClientId=self._client
             )
             self._bullet.resetBaseVelocity(
-                vehicle, body.velocity[row].tolist(), turning[row].tolist(), physicsClientId=self._client
+                vehicle, states.velocity[row].tolist(), turning[row].tolist(), physicsClientId=self._client
             )
-        self._actuator.place(body.rotor_speed_rpm, which)
+        self._actuator.place(states.rotor_speed_rpm, which)
 
     def advance(self, action: np.ndarray) -> None:
         """Let one control period pass, see `World`."""
@@ -115,7 +117,7 @@ class PyBulletSimulator:
 
     def _resist(self, rotor_speed_rpm: np.ndarray, forces: np.ndarray) -> np.ndarray:
         """The thrusts with ground effect; drag is applied on the way."""
-        body = self.body()
+        body = self.states()
         drag = -self._drag * body.velocity
         if self._options.rotor_drag:
             drag += rotor_drag(body.attitude, body.velocity, rotor_speed_rpm)
@@ -125,7 +127,7 @@ class PyBulletSimulator:
             return forces
         return forces * (1 + ground_effect(self._vehicle, body.position, body.attitude))
 
-    def body(self) -> VehicleStates:
+    def states(self) -> VehicleStates:
         """Where the vehicles are, see `World`."""
         bullet, client = self._bullet, self._client
         places = [bullet.getBasePositionAndOrientation(vehicle, client) for vehicle in self._vehicles]

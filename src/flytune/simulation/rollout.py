@@ -53,7 +53,7 @@ def rollout(
     ending: Callable[..., Any] = environment.restart,
     record: Callable[[Episode, Episode, environment.Outcome], Any],
     draw: Callable[[Any], Draw] = lambda given: given,
-    fresh_memory: Memory = (),
+    fresh_memory: Memory = None,
     slack: Any = None,
     physics: Physics = dynamics.step,
     rematerialise: bool = False,
@@ -70,7 +70,7 @@ def rollout(
         ending: what follows a step, `environment.restart` or `environment.hold`.
         record: (episode after, episode the step led to, outcome) -> what is kept; applied to one episode.
         draw: a slice of `inputs` -> the random numbers of a step.
-        fresh_memory: the memory of a new episode, batched like the memory.
+        fresh_memory: the memory of new episodes, batched like the memory; None keeps the memory through an ending.
         slack: share of a bound by which a margin may be overdrawn before the episode ends; None for none.
         physics: the simulator's step.
         rematerialise: keep only the episodes between steps for a gradient, and compute each step again.
@@ -98,7 +98,8 @@ def rollout(
         memory, action, notes = decide(memory, see(episodes, now.noise), now.controller, episodes)
         episodes, moved, over, recorded = step(episodes, action.T, now.keys)
         following = None if now.next_noise is None else see(moved, now.next_noise)
-        memory = jax.tree.map(partial(_where, over), fresh_memory, memory)
+        if fresh_memory is not None:
+            memory = jax.tree.map(partial(_where, over), fresh_memory, memory)
         return (episodes, memory), Step(notes, following, recorded)
 
     return jax.lax.scan(advance, start, inputs)

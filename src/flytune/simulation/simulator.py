@@ -1,15 +1,23 @@
-"""Worlds: simulators behind one small interface. NumPy only."""
+"""The simulator protocol, and vehicle states as arrays: what crosses the border between a simulator and all else."""
 
 import dataclasses
-from typing import Protocol, runtime_checkable
+from collections.abc import Callable
+from typing import Any, Protocol, runtime_checkable
 
+import jax
+import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Array, Float, Int
+
+from flytune.physics.dynamics import State
+
+WIDTHS = {"position": 3, "attitude": 4, "velocity": 3, "body_rate": 3, "rotor_speed_rpm": 4}  # of a row, in order
+WIDTH = sum(WIDTHS.values())  # 17
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class VehicleStates:
-    """Where N vehicles are and how they move."""
+    """The states of N vehicles."""
 
     position: np.ndarray  # [N, 3] m, inertial frame, z up
     attitude: np.ndarray  # [N, 4] unit quaternion (x, y, z, w), body to inertial
@@ -17,15 +25,27 @@ class VehicleStates:
     body_rate: np.ndarray  # [N, 3] rad/s, body frame
     rotor_speed_rpm: np.ndarray  # [N, 4] rpm
 
+    @classmethod
+    def from_rows(cls, rows: Float[np.ndarray, "*batch 17"]) -> "VehicleStates":
+        """The states from one row of numbers each."""
+        parts = np.split(rows, np.cumsum(list(WIDTHS.values()))[:-1], axis=-1)
+        return cls(**dict(zip(WIDTHS, parts, strict=True)))
+
+    def rows(self) -> Float[np.ndarray, "*batch 17"]:
+        """One row of numbers for each vehicle, in the order of `WIDTHS`."""
+        return np.concatenate([getattr(self, name) for name in WIDTHS], axis=-1)
+
 
 @runtime_checkable
 class Simulator(Protocol):
-    """N vehicles of one kind, side by side in a simulator; they do not touch each other."""
+    """N vehicles of one kind, side by side; they do not touch each other."""
 
-    def place(self, body: VehicleStates, which: Int[np.ndarray, "K"] | None = None) -> None:
-        """Put the vehicles there: all N of them, or those at the K indices `which`, and then `body` holds K.
+    physics: Callable[..., Any] | None  # one control period in JAX, (vehicle, State, action) -> State; None without JAX
 
-        Their rotors turn at the speeds `body` gives, and no action is on its way to them.
+    def place(self, states: VehicleStates, which: Int[np.ndarray, "K"] | None = None) -> None:
+        """Put the vehicles there: all N of them, or those at the K indices `which`, and then `states` holds K.
+
+        Their rotors turn at the speeds `states` gives, and no action is on its way to them.
         """
         ...
 
@@ -33,13 +53,27 @@ class Simulator(Protocol):
         """Let one control period (0.01 s) pass under actions [N, 4], clipped to [-1, 1]."""
         ...
 
-    def body(self) -> VehicleStates:
-        """Where the vehicles are now."""
+    def states(self) -> VehicleStates:
+        """The states of the vehicles now."""
         ...
 
     def close(self) -> None:
         """Give the simulator's memory back."""
         ...
+
+
+def state_numbers(state: State) -> Float[Array, "17 *batch"]:
+    """A state as one array, one number of every vehicle after the other; actions on their way are left out."""
+    return jnp.stack([number for name in WIDTHS for number in getattr(state, name)])
+
+
+def state_from(numbers: Float[Array, "17 *batch"], pending_actions: jax.Array) -> State:
+    """The state whose numbers these are, with its actions on their way [latency, 4, ...]."""
+    parts, first = {}, 0
+    for name, width in WIDTHS.items():
+        parts[name] = tuple(numbers[first : first + width])
+        first += width
+    return State(**parts, pending_actions=pending_actions)
 
 
 def rotation_matrix(attitude: Float[np.ndarray, "N 4"]) -> Float[np.ndarray, "N 3 3"]:

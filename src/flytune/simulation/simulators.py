@@ -1,4 +1,4 @@
-"""Worlds by name: whoever flies elsewhere asks here."""
+"""Simulators by name."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -12,7 +12,7 @@ SIMULATORS = ("flytune", "pybullet", "mujoco")
 
 
 def make_simulator(name: str, vehicle: Vehicle, number: int, options: Mapping[str, Any] | None = None) -> Simulator:
-    """A simulator with `number` vehicles of one kind in it; nobody has placed them yet.
+    """A simulator with `number` vehicles of one kind in it, not placed yet.
 
     Args:
         name: one of WORLDS.

@@ -1,12 +1,13 @@
 """Families of tasks: what a rollout flies, where some numbers of the task or the vehicle change from episode to episode."""
 
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import jax
 
 from flytune.task.task import Task
 
 
+@runtime_checkable
 class TaskFamily(Protocol):
     """Tasks of one structure that differ in numbers: a bound that a dial sets, a mass that is drawn per episode.
 

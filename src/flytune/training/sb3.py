@@ -18,12 +18,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from flytune.adapters.batch import Transition
 from flytune.config.pytree import pytree, static
 from flytune.control.policy import Network, Policy
 from flytune.errors import Diverged
 from flytune.export.untrusted.sb3_model import actor_network
-from flytune.simulation.environment import Episode
+from flytune.simulation.host import Transition
 from flytune.task.observation import SIZE
 from flytune.task.task import Task
 from flytune.task.termination import causes
@@ -53,7 +52,7 @@ class TrainState:
     first_moments: dict[str, Any]  # Adam's, by the same names
     second_moments: dict[str, Any]
     ema: Network  # exponential moving average of the actor over updates; the one that is flown
-    episodes: Episode  # a batch, along the last axis
+    episodes: Any  # [K, N] as `HostEnvironment` keeps them
     key: Any  # raw, of starts and noise
     observation: Any  # [N, 17] last seen
     torch_random: Any  # the state of torch's generator: actions
@@ -152,11 +151,11 @@ class _Workbench:
             for index, (name, _) in enumerate(network.named_parameters())
         }
         network.optimizer.load_state_dict({**network.optimizer.state_dict(), "state": memory})
-        batch = self.environments.batch
+        environment = self.environments.environment
         # copies, since the step's compiled code uses their memory again
-        batch.episodes = jax.tree.map(jnp.array, train_state.episodes)
-        batch.key = jax.random.wrap_key_data(jnp.array(train_state.key))
-        batch.observation = np.array(train_state.observation)
+        environment.episodes = jnp.array(train_state.episodes)
+        environment.key = jax.random.wrap_key_data(jnp.array(train_state.key))
+        environment.observation = np.array(train_state.observation)
         numbers = np.array(train_state.numpy_random)
         # the global one, since it is what Stable-Baselines3 draws from
         np.random.set_state(  # noqa: NPY002
@@ -168,7 +167,7 @@ class _Workbench:
         """Model, environments and random numbers as they are, in copies: the fields of a learner."""
         import torch
 
-        network, batch = self.model.policy, self.environments.batch
+        network, environment = self.model.policy, self.environments.environment
         memory = network.optimizer.state  # empty before the first step, when the moments are zero
         named = list(network.named_parameters())
 
@@ -184,9 +183,9 @@ class _Workbench:
             "weights": {name: weight.detach().numpy().copy() for name, weight in named},
             "first_moments": moments("exp_avg"),
             "second_moments": moments("exp_avg_sq"),
-            "episodes": jax.tree.map(np.array, batch.episodes),
-            "key": np.array(jax.random.key_data(batch.key)),
-            "observation": batch.observation.copy(),
+            "episodes": np.array(environment.episodes),
+            "key": np.array(jax.random.key_data(environment.key)),
+            "observation": environment.observation.copy(),
             "torch_random": torch.get_rng_state().numpy().copy(),
             "numpy_random": np.append(state["key"], np.uint32(state["pos"])),
             "minibatches": jnp.asarray(max(steps, default=0), jnp.int32),
@@ -207,7 +206,7 @@ class _Workbench:
                 transitions.append(environments.transition)
                 return True
 
-        self.model._last_obs = environments.batch.observation
+        self.model._last_obs = environments.environment.observation
         # whether a rollout's first step began an episode: kept for those that look further back, and nobody here does
         self.model._last_episode_starts = np.ones(self.settings.environments, bool)
         samples = self.settings.environments * self.settings.rollout

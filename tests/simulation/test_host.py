@@ -1,12 +1,13 @@
-"""A batch of episodes: what an outside trainer is told is what the core does."""
+"""The rollout on the host: what an outside trainer is told is what the environment does, in any simulator."""
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from flytune.adapters.batch import Batch
 from flytune.simulation import environment
+from flytune.simulation.host import HostEnvironment, unravel
+from flytune.simulation.jax_simulator import JaxSimulator
 from flytune.task.task import load_task
 from flytune.task.termination import causes
 
@@ -14,10 +15,25 @@ QUIET = {f"noise.{block}": 0.0 for block in ("position", "attitude", "velocity",
 NUMBER = 6
 
 
+class OnTheHost(JaxSimulator):
+    """flytune's simulator as one that JAX cannot look into."""
+
+    def __init__(self, vehicle, number):
+        super().__init__(vehicle, number)
+        self.physics = None
+
+
+def make(task, seed=0, simulator=JaxSimulator):
+    """Six episodes of a task that have just begun."""
+    made = HostEnvironment(task, simulator(task.vehicle, NUMBER), NUMBER)
+    made.reset(seed)
+    return made
+
+
 @pytest.fixture
 def noisy():
-    """A batch of the baseline task."""
-    return Batch(load_task("baseline"), NUMBER, seed=1)
+    """Six episodes of the baseline task."""
+    return make(load_task("baseline"), seed=1)
 
 
 def actions(steps, seed=0):
@@ -26,22 +42,22 @@ def actions(steps, seed=0):
 
 
 def one(episodes, index):
-    """A single episode of the batch."""
+    """One of the episodes."""
     return jax.tree.map(lambda part: part[..., index], episodes)
 
 
 def test_every_step_is_the_core_s_step_and_the_final_observation_is_of_the_state_before_the_reset():
     task = load_task("baseline", QUIET)
-    batch, ends = Batch(task, NUMBER, seed=1), 0
+    batch, ends = make(task, seed=1), 0
 
     @jax.jit
     def alone(task, episodes, index, action):
-        after, outcome = environment.step(task, one(episodes, index), action)
-        return outcome, environment.look(task, after, jnp.zeros(13))
+        after, outcome = environment.step(task, one(unravel(task, episodes), index), action)
+        return outcome, environment.observe(task, after, jnp.zeros(13))
 
     @jax.jit
     def seen(task, episodes, index):
-        return environment.look(task, one(episodes, index), jnp.zeros(13))
+        return environment.observe(task, one(unravel(task, episodes), index), jnp.zeros(13))
 
     for action in actions(40):
         before = batch.episodes
@@ -56,7 +72,7 @@ def test_every_step_is_the_core_s_step_and_the_final_observation_is_of_the_state
             np.testing.assert_allclose(moved.observation[index], now, rtol=1e-5, atol=2e-5)
             if moved.ended[index]:
                 ends += 1
-                assert batch.episodes.steps[index] == 0
+                assert batch.steps()[index] == 0
                 assert not np.allclose(moved.observation[index], moved.final_observation[index], atol=1e-2)
                 np.testing.assert_array_equal(moved.observation[index][13:], 0)  # last action of a new episode
             else:
@@ -77,7 +93,7 @@ def test_terms_add_up_to_the_reward_and_rewards_to_the_return(noisy):
 
 
 def test_an_episode_that_reaches_its_horizon_is_truncated_and_did_not_fail():
-    batch = Batch(load_task("baseline", {"horizon": 3}), NUMBER)
+    batch = make(load_task("baseline", {"horizon": 3}))
     truncated = [batch.step(np.zeros((NUMBER, 4), np.float32)) for _ in range(6)]
     assert [moved.truncated.tolist() for moved in truncated] == 2 * [
         [False] * NUMBER,
@@ -89,7 +105,7 @@ def test_an_episode_that_reaches_its_horizon_is_truncated_and_did_not_fail():
 
 
 def test_a_failure_is_told_with_its_cause():
-    batch = Batch(load_task("baseline", {"termination.speed.bound": 0.01}), NUMBER)
+    batch = make(load_task("baseline", {"termination.speed.bound": 0.01}))
     moved = batch.step(np.full((NUMBER, 4), -1.0, np.float32))
     assert moved.terminated.all() and not moved.truncated.any()
     assert {causes(batch.task.termination)[cause] for cause in moved.cause} == {"speed"}
@@ -102,8 +118,8 @@ def test_a_seed_fixes_everything_that_follows(noisy):
     first = fly(noisy)
     noisy.reset(1)
     np.testing.assert_array_equal(first, fly(noisy))
-    np.testing.assert_array_equal(first, fly(Batch(noisy.task, NUMBER, seed=1)))
-    assert not np.allclose(first[0], Batch(noisy.task, NUMBER, seed=2).observation, atol=1e-2)
+    np.testing.assert_array_equal(first, fly(make(noisy.task, seed=1)))
+    assert not np.allclose(first[0], make(noisy.task, seed=2).observation, atol=1e-2)
     assert not np.allclose(noisy.reset(1), noisy.reset(), atol=1e-2)  # without a seed the random numbers go on
 
 
@@ -126,8 +142,10 @@ def test_a_partial_reset_leaves_the_others_alone(noisy):
     observation = noisy.reset(which=which)
     np.testing.assert_array_equal(observation[~which], moved.observation[~which])
     assert (np.abs(observation - moved.observation).max(axis=1) > 1e-2).tolist() == which.tolist()
-    assert noisy.episodes.steps.tolist() == [0, 1, 1, 0, 1, 1]
-    np.testing.assert_array_equal(noisy.bodies()[:, 3:7], np.stack(noisy.episodes.state.attitude, axis=-1))
+    assert noisy.steps().tolist() == [0, 1, 1, 0, 1, 1]
+    np.testing.assert_array_equal(
+        noisy.states[:, 3:7], np.stack(unravel(noisy.task, noisy.episodes).state.attitude, axis=-1)
+    )
 
 
 def test_what_it_gives_may_be_written_to_and_stays_as_it_was(noisy):
@@ -137,3 +155,18 @@ def test_what_it_gives_may_be_written_to_and_stays_as_it_was(noisy):
     np.testing.assert_array_equal(first.observation, kept)
     first.observation[:] = 0  # refused where the memory were JAX's own
     first.final_observation[:] = 0
+
+
+def test_a_simulator_on_the_host_brings_the_same_as_one_on_the_device():
+    task = load_task("baseline", {"horizon": 12})
+    here, there = make(task, seed=3), make(task, seed=3, simulator=OnTheHost)
+    np.testing.assert_array_equal(here.observation, there.observation)
+    ends = 0
+    for action in actions(30):
+        one_way, other = here.step(action), there.step(action)
+        for name in ("observation", "final_observation", "states", "reward", "episode_return"):
+            found, expected = getattr(other, name), getattr(one_way, name)
+            np.testing.assert_allclose(found, expected, rtol=1e-5, atol=2e-5, err_msg=name)
+        np.testing.assert_array_equal(other.ended, one_way.ended)
+        ends += int(one_way.ended.sum())
+    assert ends > NUMBER  # new episodes are placed in the simulator, too

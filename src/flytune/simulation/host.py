@@ -1,0 +1,258 @@
+"""The rollout on the host: episodes stepped one control period at a time, in any simulator, behind NumPy arrays.
+
+It serves simulators that JAX cannot look into, and interfaces that ask for one step at a time. A call of compiled code
+costs more per array that goes in or comes out than its arithmetic: so the task's numbers, the episodes and the report
+each cross as one array of float32, which holds the whole numbers among them exactly.
+"""
+
+import dataclasses
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, Float
+
+from flytune.physics.dynamics import hovering
+from flytune.simulation import environment
+from flytune.simulation.environment import Episode
+from flytune.simulation.rollout import reset_all
+from flytune.simulation.simulator import WIDTH, Simulator, VehicleStates, state_from, state_numbers
+from flytune.task.observation import NOISY, SIZE
+from flytune.task.task import Task
+
+Noise = Float[np.ndarray, "13 N"] | Float[Array, "13 N"]
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Transition:
+    """What one step of N episodes brought; with `restart`, one that ended has already begun its next episode."""
+
+    observation: np.ndarray  # [N, 17] what to act on next: of the new episode where the old one ended
+    final_observation: np.ndarray  # [N, 17] of the state the action led to, before any new episode
+    states: np.ndarray  # [N, 17] position, attitude, velocity, body rate, rotor speeds in rpm; of `observation`
+    reward: np.ndarray  # [N]
+    terms: dict[str, np.ndarray]  # [N] each: the reward of each term; they add up to `reward`
+    terminated: np.ndarray  # [N] bool; failed, nothing comes after
+    truncated: np.ndarray  # [N] bool; the horizon is reached, what would come after still counts
+    cause: np.ndarray  # [N] int; why it failed, an index into `causes(task.termination)`, or SAFE
+    episode_return: np.ndarray  # [N] sum of rewards since the episode's start, this step included
+    episode_length: np.ndarray  # [N] int; steps since the episode's start, this one included
+    crashed: np.ndarray  # [N] bool; with `hold`: the vehicle has crashed, in this step or before
+
+    @property
+    def ended(self) -> np.ndarray:
+        """Which episodes are over by a termination or by the horizon, [N] bool."""
+        return self.terminated | self.truncated
+
+
+def _stay(family: Any, before: Episode, moved: Episode, outcome: Any, key: None) -> tuple[Episode, Array]:
+    return moved, outcome.terminated | outcome.truncated
+
+
+ENDINGS: dict[str, Callable[..., Any]] = {
+    "restart": environment.restart,  # an episode that is over is followed by a new one
+    "hold": environment.hold,  # a crashed vehicle stays where it was
+    "none": _stay,  # what comes after the end is the caller's affair
+}
+
+
+class HostEnvironment:
+    """N episodes of one task in one simulator, which step together.
+
+    `episodes`, `key` and `observation` are all that changes in flytune's own simulator: kept and put back, they let it
+    go on exactly as before.
+
+    Args:
+        task: what is flown.
+        simulator: with N vehicles in it.
+        number: N.
+        ending: what follows the end of an episode, one of `ENDINGS`.
+    """
+
+    def __init__(self, task: Task, simulator: Simulator, number: int, ending: str = "restart") -> None:
+        self.task, self.number, self.simulator = task, number, simulator
+        leaves, structure = jax.tree.flatten(task)
+        self._numbers = jnp.asarray(np.asarray(leaves, np.float32))
+        self._structure, self._ending = structure, ending
+        self._terms = sorted(task.reward)
+        self.key: Array | None = None  # of noise and new episodes, where `step` is given none
+        self.episodes: Any = np.zeros((0, number), np.float32)  # [K, N], see `unravel`
+        self.observation = np.zeros((number, SIZE), np.float32)
+        self.states = np.zeros((number, WIDTH), np.float32)
+        self._parked = np.zeros(number, bool)
+
+    def reset(self, seed: int | None = None, which: np.ndarray | None = None) -> np.ndarray:
+        """The observation [N, 17] after new episodes of those in the mask `which` [N], all where None.
+
+        A seed makes everything that follows reproducible; without one the random numbers go on.
+        """
+        if seed is not None:
+            self.key = jax.random.key(seed)
+        key, episodes, report = _draw(self._structure, self.number, self._numbers, self.key)
+        self.key = key
+        return self._take(episodes, np.array(report), which)
+
+    def start(self, episodes: Any, noise: Noise) -> np.ndarray:
+        """The observation [N, 17] of given episodes [K, N], see `draw_episodes` and `episodes_at`."""
+        return self._take(episodes, np.array(_look(self._structure, self._numbers, episodes, noise)), None)
+
+    def _take(self, episodes: Any, report: np.ndarray, which: np.ndarray | None) -> np.ndarray:
+        seen, states = report[:SIZE].T.copy(), report[SIZE:].T.copy()
+        if which is not None:
+            episodes = jnp.where(which, episodes, self.episodes)
+            seen = np.where(which[:, None], seen, self.observation)
+            states = np.where(which[:, None], states, self.states)
+        self.episodes, self.observation, self.states = episodes, seen, states
+        self._parked = np.zeros(self.number, bool)
+        if self.simulator.physics is None:
+            chosen = None if which is None else np.flatnonzero(which)
+            self.simulator.place(VehicleStates.from_rows(states if chosen is None else states[chosen]), chosen)
+        return self.observation
+
+    def step(self, action: np.ndarray, noise: Noise | None = None) -> Transition:
+        """What actions [N, 4] brought; they are clipped to [-1, 1].
+
+        Args:
+            action: one per vehicle.
+            noise: 13 standard normal numbers for each observation; drawn with the environment's own key where None.
+        """
+        physics, reached = self.simulator.physics, None
+        action = np.asarray(action, np.float32)
+        if physics is None:
+            self.simulator.advance(np.where(self._parked[:, None], 0.0, action))
+            reached = self.simulator.states().rows().astype(np.float32).T
+        how = (self._structure, self._ending, physics)
+        key = self.key if noise is None or self._ending == "restart" else None
+        self.key, self.episodes, report = _step(*how, self._numbers, self.episodes, key, action, noise, reached)
+        return self._told(np.array(report))
+
+    def _told(self, report: np.ndarray) -> Transition:
+        cuts = np.cumsum([SIZE, SIZE, WIDTH, WIDTH])
+        seen, final, states, placed, outcome = np.split(report, cuts)
+        reward, cause, truncated, total, length, over, *terms = outcome.astype(float)
+        self.observation, self.states, ended = seen.T.copy(), states.T.copy(), over > 0
+        new = np.flatnonzero(ended & ~self._parked)
+        if self.simulator.physics is None and self._ending != "none" and len(new):
+            self.simulator.place(VehicleStates.from_rows(placed.T[new]), new)
+        if self._ending == "hold":
+            self._parked = ended
+        return Transition(
+            observation=self.observation,
+            final_observation=final.T.copy(),
+            states=self.states,
+            reward=reward,
+            terms=dict(zip(self._terms, terms, strict=True)),
+            terminated=cause >= 0,
+            truncated=truncated > 0,
+            cause=cause.astype(np.int64),
+            episode_return=total,
+            episode_length=length.astype(np.int64),
+            crashed=ended if self._ending == "hold" else np.zeros(self.number, bool),
+        )
+
+    def steps(self) -> np.ndarray:
+        """How many steps old each episode is, [N] int."""
+        return np.asarray(_steps(self._structure, self._numbers, self.episodes)).astype(int)
+
+    def close(self) -> None:
+        """Give the simulator's memory back."""
+        self.simulator.close()
+
+
+@jax.jit
+def draw_episodes(task: Task, keys: Array) -> Array:
+    """New episodes [K, N] drawn with keys [N]."""
+    return ravel(reset_all(task, keys))
+
+
+@jax.jit
+def episodes_at(task: Task, states: Float[Array, "17 N"]) -> Array:
+    """Episodes [K, N] that begin in given states."""
+
+    def one(numbers: Array) -> Episode:
+        pending = jnp.zeros((task.vehicle.action_latency_steps, 4))
+        return environment.begin(state_from(numbers, pending))
+
+    return ravel(jax.vmap(one, in_axes=-1, out_axes=-1)(states))
+
+
+def ravel(episodes: Episode) -> Array:
+    """Episodes as one array [K, N]."""
+    return jax.vmap(lambda episode: ravel_pytree(episode)[0], in_axes=-1, out_axes=-1)(episodes)
+
+
+def unravel(task: Task, numbers: Array) -> Episode:
+    """The episodes of an array [K, N]; which key draws the example does not matter, and it is never drawn."""
+    back = ravel_pytree(environment.reset(task, jax.random.key(0)))[1]
+    return jax.vmap(back, in_axes=-1, out_axes=-1)(numbers)
+
+
+def _seen(task: Task, episodes: Episode, noise: Any) -> Float[Array, "17 N"]:
+    return jax.vmap(partial(environment.observe, task), in_axes=-1, out_axes=-1)(episodes, noise)
+
+
+@partial(jax.jit, static_argnums=(0, 1))
+def _draw(structure: Any, number: int, numbers: Array, key: Array) -> tuple[Array, Array, Array]:
+    task = jax.tree.unflatten(structure, list(numbers))
+    key, start_key, noise_key = jax.random.split(key, 3)
+    episodes = reset_all(task, jax.random.split(start_key, number))
+    seen = _seen(task, episodes, jax.random.normal(noise_key, (NOISY, number)))
+    return key, ravel(episodes), jnp.concatenate([seen, state_numbers(episodes.state)])
+
+
+@partial(jax.jit, static_argnums=0)
+def _look(structure: Any, numbers: Array, episodes: Array, noise: Any) -> Array:
+    task = jax.tree.unflatten(structure, list(numbers))
+    begun = unravel(task, episodes)
+    return jnp.concatenate([_seen(task, begun, noise), state_numbers(begun.state)])
+
+
+@partial(jax.jit, static_argnums=0)
+def _steps(structure: Any, numbers: Array, episodes: Array) -> Array:
+    return unravel(jax.tree.unflatten(structure, list(numbers)), episodes).steps
+
+
+@partial(jax.jit, static_argnums=(0, 1, 2))
+def _step(
+    structure: Any,
+    ending: str,
+    physics: Any,
+    numbers: Array,
+    episodes: Array,
+    key: Array | None,
+    action: Array,
+    noise: Any,
+    reached: Array | None,
+) -> tuple[Array | None, Array, Array]:
+    """The key, the episodes after a step, and all that `HostEnvironment` tells of it, as one array."""
+    task, number = jax.tree.unflatten(structure, list(numbers)), action.shape[0]
+    before, keys = unravel(task, episodes), None
+    if key is not None:
+        key, noise_key, start_key = jax.random.split(key, 3)
+        noise = jax.random.normal(noise_key, (NOISY, number)) if noise is None else noise
+        keys = jax.random.split(start_key, number) if ending == "restart" else None
+
+    def one(episode: Episode, action: Array, elsewhere: Any, key: Any) -> Any:
+        if elsewhere is None:
+            moved, outcome = environment.step(task, episode, action, physics)
+        else:  # what is on its way to the motors stays in the simulator
+            state = state_from(elsewhere, episode.state.pending_actions)
+            moved, outcome = environment.assess(task, episode, state, jnp.clip(action, -1.0, 1.0))
+        return *ENDINGS[ending](task, episode, moved, outcome, key), moved, outcome
+
+    axes = (-1, -1, None if reached is None else -1, 0)
+    after, over, moved, outcome = jax.vmap(one, in_axes=axes, out_axes=-1)(before, action.T, reached, keys)
+    seen = _seen(task, after, noise)
+    final = _seen(task, moved, noise) if ending == "restart" else seen
+    states = placed = state_numbers(after.state)
+    if ending == "hold":  # where the simulator has no trouble with a crashed vehicle
+        at_target = state_numbers(hovering(task.vehicle, task.target.position))
+        placed = jnp.broadcast_to(at_target[:, None], states.shape)
+    told = [outcome.reward, outcome.cause, outcome.truncated, moved.reward, moved.steps, over]
+    told += [outcome.terms[name] for name in sorted(outcome.terms)]
+    told = jnp.stack([each.astype(jnp.float32) for each in told])
+    return key, ravel(after), jnp.concatenate([seen, final, states, placed, told])
