@@ -14,6 +14,7 @@ from flytune.errors import BadInput, Diverged
 from flytune.evaluation.flights import Flights
 from flytune.physics.dynamics import CONTROL_PERIOD
 from flytune.physics.vehicle import Vehicle
+from flytune.runs.find import FoundController
 from flytune.simulation.environment import Episode, Outcome, begin, hold, is_crashed, margins_along
 from flytune.simulation.host import HostEnvironment, ravel
 from flytune.simulation.rollout import Draw, rollout
@@ -28,7 +29,7 @@ InitialConditions = Literal["clear", "paper"]
 
 
 def fly(
-    controller: Controller,
+    controller: Controller | FoundController,
     task: Task,
     *,
     trials: int = 100,
@@ -59,7 +60,7 @@ def fly(
         BadInput: an argument out of range, or a simulator that is not installed.
         Diverged: the controller answered a finite observation with an action that is not finite.
     """
-    if hasattr(controller, "controller"):  # found by name: it knows what it is called
+    if isinstance(controller, FoundController):
         controller, name = controller.controller, name or controller.name
     duration = task.duration if duration is None else duration
     if not 1 <= trials <= 100_000:
@@ -76,9 +77,9 @@ def fly(
     keys = trial_keys(seed, trials)
     starts, noise_keys = _begin(task, EVALUATION_INITIAL_STATES[initial_conditions], keys)
     if isinstance(simulator, str):
-        flown_in = make_simulator(simulator, task.vehicle, trials, simulator_options)
+        where, flown_in = simulator, make_simulator(simulator, task.vehicle, trials, simulator_options)
     else:
-        flown_in, simulator = simulator(task.vehicle, trials), getattr(simulator, "__name__", "custom")
+        where, flown_in = getattr(simulator, "__name__", "custom"), simulator(task.vehicle, trials)
     try:
         record = rollout_trials(flown_in, controller, task, starts, noise_keys, steps, name)
     finally:
@@ -97,7 +98,7 @@ def fly(
         name=name,
         task=task.name,
         vehicle=task.vehicle.name,
-        simulator=simulator,
+        simulator=where,
         seed=seed,
         initial_conditions=initial_conditions,
     )

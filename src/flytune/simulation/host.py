@@ -79,7 +79,7 @@ class HostEnvironment:
         self._numbers = jnp.asarray(np.asarray(leaves, np.float32))
         self._structure, self._ending = structure, ending
         self._terms = sorted(task.reward)
-        self.key: Array | None = None  # of noise and new episodes, where `step` is given none
+        self.key: Any = None  # of noise and new episodes, where `step` is given none
         self.episodes: Any = np.zeros((0, number), np.float32)  # [K, N], see `unravel`
         self.observation = np.zeros((number, SIZE), np.float32)
         self.states = np.zeros((number, WIDTH), np.float32)

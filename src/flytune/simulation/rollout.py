@@ -35,7 +35,7 @@ class Step(NamedTuple):
     """What a rollout gives for every step, [T, ...]."""
 
     notes: Any  # what `decide` gave beside the action
-    following: Float[Array, "T N 17"] | None  # the observation after the step, where `Draw.next_noise` asks for it
+    following: Any  # [T, N, 17] the observation after the step, where `Draw.next_noise` asks for it
     record: Any  # what `record` kept
 
 

@@ -40,7 +40,10 @@ class VehicleStates:
 class Simulator(Protocol):
     """N vehicles of one kind, side by side; they do not touch each other."""
 
-    physics: Callable[..., Any] | None  # one control period in JAX, (vehicle, State, action) -> State; None without JAX
+    @property
+    def physics(self) -> Callable[..., Any] | None:
+        """One control period as a function in JAX, (vehicle, State, action) -> State; None where there is none."""
+        ...
 
     def place(self, states: VehicleStates, which: Int[np.ndarray, "K"] | None = None) -> None:
         """Put the vehicles there: all N of them, or those at the K indices `which`, and then `states` holds K.
