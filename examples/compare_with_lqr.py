@@ -13,13 +13,9 @@ parser.add_argument("--trials", type=int, default=100, help="trials of each cont
 options = parser.parse_args()
 
 task = flytune.load_task("baseline-refined")
-policy = flytune.find_controller("baseline-refined").controller  # a policy that ships with flytune
-lqr = flytune.classical_controller("lqr", task)
-
-judgements = [
-    flytune.judge(flytune.fly(controller, task, trials=options.trials, seed=1, name=name))
-    for name, controller in {"policy": policy, "lqr": lqr}.items()
-]
+# "baseline-refined" is also the name of a policy that ships with flytune
+evaluations = flytune.evaluate_all(["baseline-refined", "lqr"], task, trials=options.trials, seed=1)
+judgements = [evaluation.judgement for evaluation in evaluations]
 comparison = flytune.compare(judgements)  # paired, trial by trial; the first one is the reference
 print(comparison)
 

@@ -18,7 +18,7 @@ parser.add_argument("--trials", type=int, default=20, help="trials in each simul
 options = parser.parse_args()
 
 task = flytune.load_task("baseline-refined")
-policy = flytune.find_controller("baseline-refined").controller
+policy = flytune.find_controller("baseline-refined")
 
 here = flytune.fly(policy, task, trials=options.trials, duration=5.0)
 there = flytune.fly(policy, task, trials=options.trials, duration=5.0, simulator=options.simulator)

@@ -43,6 +43,6 @@ class Switched:
 
 
 task = flytune.load_task("baseline-refined")
-policy = flytune.find_controller("baseline-refined").controller
+policy = flytune.find_controller("baseline-refined")
 controller = Switched(far=policy, near=flytune.classical_controller("lqr", task), distance=0.3)
 print(flytune.judge(flytune.fly(controller, task, trials=options.trials, name="switched")))

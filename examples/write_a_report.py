@@ -13,6 +13,7 @@ parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
 parser.add_argument("--trials", type=int, default=100, help="trials that the page shows")
 options = parser.parse_args()
 
+# a run directory, a policy file, a policy that ships, or a classical controller
 evaluation = flytune.evaluate("baseline-refined", trials=options.trials, seed=1)
 flytune.write_report(Path("report.html"), [evaluation])
 print("open report.html in a browser")
