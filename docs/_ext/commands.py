@@ -12,7 +12,7 @@ from sphinx.util.docutils import SphinxDirective
 
 def help_of(*command: str) -> str:
     """The help text of `flytune COMMAND`."""
-    settings = {"COLUMNS": "100", "LINES": "1000", "NO_COLOR": "1", "TERM": "dumb", "PYTHONUTF8": "1"}
+    settings = {"COLUMNS": "88", "LINES": "1000", "NO_COLOR": "1", "TERM": "dumb", "PYTHONUTF8": "1"}
     answer = subprocess.run(
         [sys.executable, "-m", "flytune", *command, "--help"],
         env={**os.environ, **settings},
