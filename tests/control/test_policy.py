@@ -1,5 +1,6 @@
 """Policies: what they answer, how they start, and the file they are kept in (paper R7, R9, R16)."""
 
+import itertools
 import json
 import math
 
@@ -111,10 +112,14 @@ def test_a_policy_is_read_back_to_the_last_bit(policy, saved):
         np.testing.assert_array_equal(one, other)
 
 
-def test_a_network_of_another_depth_is_read_back(tmp_path):
-    shallow = Network(weights=(jnp.ones((17, 4)),), biases=(jnp.zeros(4),))
-    save_policy(tmp_path / "p.safetensors", Policy(actor=shallow, input_scale=jnp.ones(17), squash="tanh"))
-    assert len(load_policy(tmp_path / "p.safetensors").actor.weights) == 1
+@pytest.mark.parametrize("hidden", [(), (8,), (8, 5, 9)])
+def test_a_network_of_another_depth_is_read_back(tmp_path, observations, hidden):
+    sizes = (17, *hidden, 4)
+    deep = Policy(actor=make_network(jax.random.key(1), sizes, 0.5), input_scale=jnp.ones(17), squash="tanh")
+    save_policy(tmp_path / "p.safetensors", deep)
+    again = load_policy(tmp_path / "p.safetensors")
+    assert [weight.shape for weight in again.actor.weights] == list(itertools.pairwise(sizes))
+    np.testing.assert_array_equal(again(observations), deep(observations))
 
 
 def test_the_header_says_what_the_policy_sees_does_and_was_trained_for(saved):
