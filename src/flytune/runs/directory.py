@@ -1,4 +1,4 @@
-"""Run directories: what a training leaves behind, and what it needs to go on (docs/concepts/definitions.md)."""
+"""Run directories: the results of a training, and all that a resumed training needs (docs/concepts/definitions.md)."""
 
 import json
 import os
@@ -26,7 +26,7 @@ CHECKPOINT = Path("checkpoint") / "train_state.safetensors"  # in a run director
 
 
 def new_directory(task: Task, trainer: str, seed: int, parent: Path = Path("runs")) -> Path:
-    """A directory that does not exist yet, named after the training and numbered where the name is taken."""
+    """A directory that does not exist yet, named after the training, with a number where the name is taken."""
     base = parent / f"{task.name}-{trainer}-s{seed}"
     path, number = base, 2
     while path.exists():
@@ -173,7 +173,7 @@ def _facts(task: Task, trainer: str, seed: int, optional: Sequence[str]) -> dict
 
 
 def _commit() -> str | None:
-    """The commit flytune was run from, or None where it is not run from a checkout."""
+    """The commit of the checkout that flytune runs from, or None where it runs from none."""
     here = Path(__file__).resolve()
     environment = {name: value for name, value in os.environ.items() if not name.startswith("GIT_")}
 

@@ -1,4 +1,4 @@
-"""Controllers by name: what the command line's CONTROLLER stands for."""
+"""Controllers by name: the meaning of CONTROLLER on the command line."""
 
 import dataclasses
 import json
@@ -24,20 +24,20 @@ KINDS = f"a run directory, a policy file ({', '.join(READERS)}), {', '.join(CLAS
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class FoundController:
-    """A controller, the task it flies, and how it was made; it flies like the controller itself."""
+    """A controller, the task it flies, and how it was made. It is a controller too, and flies in the same way."""
 
     name: str
     controller: Controller
     task: Task  # the one asked for, else the one it was trained for, else the baseline
-    metrics: list[dict[str, Any]] | None  # its training, one row per update
+    metrics: list[dict[str, Any]] | None  # of its training, one row per update; None where it has none
     about: dict[str, str]  # facts for a reader
 
     def initial_memory(self) -> Any:
-        """The controller's own."""
+        """The memory of the controller before its first observation."""
         return self.controller.initial_memory()
 
     def act(self, memory: Any, observation: Any) -> Any:
-        """The controller's own."""
+        """The memory and the action of the controller, see `Controller`."""
         return self.controller.act(memory, observation)
 
     def __repr__(self) -> str:
@@ -48,7 +48,7 @@ def _bare(_: None, children: tuple[Controller]) -> Any:
     return children[0]
 
 
-# compiled code sees the controller alone
+# compiled code sees only the controller
 jax.tree_util.register_pytree_node(FoundController, lambda found: ((found.controller,), None), _bare)
 
 
@@ -58,10 +58,10 @@ def find_controller(name: str, task: str | Task | None = None) -> FoundControlle
     Args:
         name: `runs/baseline-apg-s0`, `policy.safetensors`, `policy.onnx`, a Stable-Baselines3 model `model.zip`,
             `pid`, `geometric` or `lqr` (gains tuned by search; `pid@textbook` for those of the books).
-        task: what it is to fly; its own, or the baseline, where None.
+        task: the task to fly, a preset, a TOML file or a task. Where None: the task it was trained for, or the baseline.
 
     Raises:
-        BadInput: there is no such thing, or it cannot be used.
+        BadInput: no controller has this name, or it cannot be used.
     """
     wanted = load_task(task) if isinstance(task, str) else task
     path = Path(name)
@@ -124,7 +124,9 @@ def _read_metrics(path: Path) -> list[dict[str, Any]] | None:
     try:
         rows = [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
         if not all(isinstance(row, dict) for row in rows):
-            raise ValueError("a line is no object")
+            raise ValueError("a line is not a JSON object")
     except (OSError, ValueError) as error:
-        raise BadInput(f"{path}: is damaged ({error}). Remove it to go without the learning curve.") from None
+        raise BadInput(
+            f"{path}: is damaged ({error}). Remove this file; reports then have no learning curve."
+        ) from None
     return rows
