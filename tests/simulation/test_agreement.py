@@ -200,7 +200,7 @@ def test_a_vehicle_with_its_rotors_elsewhere_hovers_and_turns_the_right_way(anyw
         np.testing.assert_allclose(rate, expected, rtol=2e-2, atol=1e-2 * np.abs(expected).max())
 
 
-@pytest.mark.parametrize(("controller", "layout"), zip(CLASSICAL, LAYOUTS, strict=True))
+@pytest.mark.parametrize(("controller", "layout"), list(zip(CLASSICAL, LAYOUTS, strict=True)))
 def test_a_classical_controller_brings_a_vehicle_with_its_rotors_elsewhere_to_the_target(layout, controller):
     task = load_task("baseline")
     task = dataclasses.replace(task, vehicle=with_layout(layout))
