@@ -55,8 +55,8 @@ def collect(environments, rollout, minibatch):
             "ppo.epochs": 1,
         },
     )
-    workbench = sb3._Workbench(task, task.ppo, seed=2)
-    model, watch = workbench.model, Watch()
+    own = sb3._Model(task, task.ppo, seed=2)
+    model, watch = own.model, Watch()
     model.learn(environments * rollout, log_interval=2)
     _, callback = model._setup_learn(environments * rollout, watch, reset_num_timesteps=False)
     model.collect_rollouts(model.env, callback, model.rollout_buffer, rollout)

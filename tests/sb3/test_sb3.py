@@ -21,8 +21,8 @@ from flytune.runs.directory import RunDirectory
 from flytune.task.task import load_task, write_task
 from flytune.training import sb3
 from flytune.training.loop import train
-from flytune.training.rollout_metrics import metrics_row
 from flytune.training.trainer import find_trainer
+from flytune.training.update import metrics_row
 
 SMALL = {
     "ppo.environments": 4,
@@ -107,10 +107,10 @@ def test_the_trainer_is_stable_baselines3s_own_training_bit_by_bit(task, whole):
     assert_identical(whole.last_policy.actor, actor_network(weights))
 
 
-def test_a_learner_can_be_moved_on_twice_and_gives_the_same(task):
+def test_the_same_training_state_can_be_updated_twice_and_gives_the_same(task):
     train_state = sb3.start(task, task.ppo, jax.random.key(5))
     first, _ = sb3.update(task, task.ppo, train_state)
-    sb3.update(task, task.ppo, first)  # leaves the workbench elsewhere
+    sb3.update(task, task.ppo, first)  # leaves the model in another state
     again, _ = sb3.update(task, task.ppo, train_state)
     assert_identical(first, again)
 

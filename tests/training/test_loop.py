@@ -12,8 +12,8 @@ from flytune.errors import BadInput, Diverged
 from flytune.runs.directory import CHECKPOINT, RunDirectory
 from flytune.task.task import load_task, write_task
 from flytune.training.loop import train
-from flytune.training.rollout_metrics import metrics_row
 from flytune.training.trainer import TRAINERS, find_trainer, trainer_names
+from flytune.training.update import metrics_row
 
 OWN = trainer_names(every_task=True)  # without Stable-Baselines3, which has its own tests
 

@@ -1,8 +1,8 @@
 """Analytic policy gradient: gradient ascent on the reward, back-propagated through the differentiable simulator.
 
-One update flies `environments` episodes for `window` steps and differentiates their mean reward, without discount or
-critic, with respect to the actor's weights. Episodes carry over from update to update. The termination conditions act
-as a barrier on their margins, a smooth function where their end of an episode has no gradient.
+One update flies `environments` episodes for `window` steps and differentiates their mean reward with respect to the
+actor's weights. There is no discount and no critic. Episodes continue from one update to the next. The end of an
+episode has no gradient; so each termination condition also adds a smooth barrier on its margin.
 """
 
 import dataclasses
@@ -21,8 +21,7 @@ from flytune.simulation.rollout import Draw, reset_all, rollout
 from flytune.task.observation import NOISY, SIZE, input_scale
 from flytune.task.task import Task
 from flytune.task.training_settings import ApgSettings
-from flytune.training.optimiser import averaged, descend
-from flytune.training.rollout_metrics import account
+from flytune.training.update import averaged, descend, rollout_metrics
 
 
 @pytree
@@ -57,7 +56,7 @@ def _optimiser(settings: ApgSettings) -> optax.GradientTransformation:
 
 @partial(jax.jit, static_argnames="settings")
 def start(task: Task, settings: ApgSettings, key: Array) -> TrainState:
-    """A learner before its first update."""
+    """The training state before the first update."""
     task = dataclasses.replace(task, initial_state=settings.initial_state)
     actor_key, episode_key, key = jax.random.split(key, 3)
     actor = make_network(actor_key, (SIZE, *settings.hidden, 4), last_gain=0.01)
@@ -74,7 +73,7 @@ def start(task: Task, settings: ApgSettings, key: Array) -> TrainState:
 
 
 def barrier(margin: Float[Array, ""], settings: ApgSettings) -> Float[Array, ""]:
-    """What a margin costs: weight * max(0, barrier_margin - margin)^2, nothing while more than that is left."""
+    """The cost of a margin: barrier_weight * max(0, barrier_margin - margin)^2."""
     return settings.barrier_weight * jnp.maximum(settings.barrier_margin - margin, 0.0) ** 2
 
 
@@ -92,7 +91,7 @@ def warm_start(settings: ApgSettings, train_state: TrainState, policy: Policy) -
 
 @partial(jax.jit, static_argnames="settings", donate_argnames="train_state")
 def update(task: Task, settings: ApgSettings, train_state: TrainState) -> tuple[TrainState, dict[str, Any]]:
-    """The learner after one update, and what it saw: reward, terms, terminations, lengths of finished episodes."""
+    """The training state after one update, and its metrics."""
     key, flight_key = jax.random.split(train_state.key)
     (_, (episodes, seen)), gradient = jax.value_and_grad(_loss, argnums=2, has_aux=True)(
         task, settings, train_state.actor, train_state.episodes, flight_key
@@ -131,4 +130,5 @@ def _loss(task: Task, settings: ApgSettings, actor: Network, episodes: Episode, 
         task, decide, (episodes, ()), draws, record=record, slack=settings.termination_slack, rematerialise=True
     )
     worth, outcome, moved = step.record
-    return -jnp.mean(worth), (episodes, {**account(task, outcome, moved), "objective": jnp.mean(worth)})
+    metrics = rollout_metrics(task, outcome, moved.reward, moved.steps)
+    return -jnp.mean(worth), (episodes, {**metrics, "objective": jnp.mean(worth)})

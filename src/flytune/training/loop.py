@@ -17,9 +17,9 @@ from flytune.errors import BadInput, Interrupted
 from flytune.runs.directory import RunDirectory, resume_command
 from flytune.task.task import Task, write_task
 from flytune.training.progress import Clock, Progress
-from flytune.training.rollout_metrics import metrics_row
 from flytune.training.tensorboard import EventLog, check_tensorboard
 from flytune.training.trainer import DEFAULT_TRAINER, Trainer, find_trainer
+from flytune.training.update import metrics_row
 
 CHECKPOINT_INTERVAL = 30.0  # s between checkpoints
 

@@ -1,9 +1,9 @@
 """Proximal policy optimisation (Schulman et al. 2017), the paper's algorithm (R16 to R18), read from top to bottom.
 
-Details follow Stable-Baselines3 2.x where the paper is silent: diagonal Gaussian with a standard deviation that does
-not depend on the state, advantages normalised per minibatch, gradients clipped by their global norm. What an episode
-would still have earned counts where its horizon cut it off, and nothing comes after a failure (Pardo et al. 2018).
-One update, rollout and twelve epochs, is one compiled function.
+Where the paper gives no detail, this follows Stable-Baselines3 2.x: a diagonal Gaussian whose standard deviation does
+not depend on the state, advantages normalised per minibatch, gradients clipped by their global norm. An episode that
+its horizon truncates counts with the value of its last state; after a failure nothing counts (Pardo et al. 2018).
+One update is one compiled function: a rollout and twelve epochs.
 """
 
 import dataclasses
@@ -25,13 +25,12 @@ from flytune.simulation.rollout import rollout as simulate
 from flytune.task.observation import NOISY, SIZE, input_scale
 from flytune.task.task import Task
 from flytune.task.training_settings import PpoSettings
-from flytune.training.optimiser import averaged, descend
-from flytune.training.rollout_metrics import account
+from flytune.training.update import averaged, descend, rollout_metrics
 
 
 @pytree
 class Parameters:
-    """What the gradient changes."""
+    """The parameters that the gradient changes."""
 
     actor: Network  # 17 -> mean of the action
     critic: Network  # 17 -> value
@@ -58,7 +57,7 @@ class Batch:
     action: Float[Array, "*batch 4"]  # as drawn, before clipping
     log_probability: Float[Array, "*batch"]
     advantage: Float[Array, "*batch"]
-    target: Float[Array, "*batch"]  # advantage + value: what the critic should have said
+    target: Float[Array, "*batch"]  # advantage + value: what the critic learns
 
 
 def policy(settings: PpoSettings, train_state: TrainState) -> Policy:
@@ -73,7 +72,7 @@ def last_policy(settings: PpoSettings, train_state: TrainState) -> Policy:
 
 @partial(jax.jit, static_argnames="settings")
 def start(task: Task, settings: PpoSettings, key: Array) -> TrainState:
-    """A learner before its first update."""
+    """The training state before the first update."""
     actor_key, critic_key, episode_key, key = jax.random.split(key, 4)
     parameters = Parameters(
         actor=make_network(actor_key, (SIZE, *settings.hidden, 4), last_gain=0.01),
@@ -93,7 +92,7 @@ def start(task: Task, settings: PpoSettings, key: Array) -> TrainState:
 
 @partial(jax.jit, static_argnames="settings", donate_argnames="train_state")
 def update(task: Task, settings: PpoSettings, train_state: TrainState) -> tuple[TrainState, dict[str, Any]]:
-    """The learner after one update, and what it saw."""
+    """The training state after one update, and its metrics."""
     key, rollout_key, shuffle_key = jax.random.split(train_state.key, 3)
     episodes, batch, seen = rollout(task, settings, train_state.parameters, train_state.episodes, rollout_key)
     flat = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), batch)
@@ -114,7 +113,7 @@ def update(task: Task, settings: PpoSettings, train_state: TrainState) -> tuple[
 def rollout(
     task: Task, settings: PpoSettings, parameters: Parameters, episodes: Episode, key: Array
 ) -> tuple[Episode, Batch, dict[str, Any]]:
-    """The episodes after `settings.rollout` steps, the samples [time, environment, ...] of the way, and its account."""
+    """The episodes after `settings.rollout` steps, the samples [time, environment, ...], and their metrics."""
     noise_key, action_key, reset_key = jax.random.split(key, 3)
     steps, width = settings.rollout, settings.environments
     noise = jax.random.normal(noise_key, (steps + 1, NOISY, width))
@@ -153,7 +152,7 @@ def rollout(
         advantage=advantage,
         target=advantage + value,
     )
-    return episodes, batch, account(task, outcome, moved)
+    return episodes, batch, rollout_metrics(task, outcome, moved.reward, moved.steps)
 
 
 def advantages(

@@ -1,8 +1,7 @@
-"""The paper's own stack (R17): Stable-Baselines3's PPO, unchanged, on our environments and in our run directories.
+"""The software of the paper (R17): Stable-Baselines3's PPO, unchanged, on flytune's environments.
 
-Everything that changes in a training lies in a `Learner` of plain arrays; Stable-Baselines3's model is a workbench that
-a learner is put on for one update and taken from again. So a checkpoint holds all there is, and a resumed training
-goes on bit by bit.
+The training state is a pytree of plain arrays. For one update it is loaded into Stable-Baselines3's model and the
+environments, and read from them afterwards. So a checkpoint is complete, and a resumed training is the same bit by bit.
 """
 
 # pyright: reportMissingImports=false
@@ -25,9 +24,8 @@ from flytune.export.untrusted.sb3_model import actor_network
 from flytune.simulation.host import Transition
 from flytune.task.observation import SIZE
 from flytune.task.task import Task
-from flytune.task.termination import causes
 from flytune.task.training_settings import PpoSettings
-from flytune.training.optimiser import averaged
+from flytune.training.update import averaged, rollout_metrics
 
 LOSSES = {  # our names -> what Stable-Baselines3 logs
     "loss": "train/loss",
@@ -39,21 +37,21 @@ LOSSES = {  # our names -> what Stable-Baselines3 logs
     "std": "train/std",
 }
 
-# what a Gaussian with numbers that are not finite, an overflowing step of Adam, and our environments are refused with
-REFUSALS = ("Expected parameter", "overflow", "not finite")
+# parts of the errors that follow from numbers that are not finite: of torch's Gaussian, of Adam, of flytune's environments
+DIVERGENCE = ("Expected parameter", "overflow", "not finite")
 
 
 @pytree
 class TrainState:
     """Everything an update needs and changes."""
 
-    workbench: Any = static()  # the `_Workbench` that updates it; holds nothing that a learner does not
+    model: Any = static()  # the `_Model` that updates it; its content is replaced at each update
     weights: dict[str, Any]  # of actor, critic and standard deviation, by torch's names
     first_moments: dict[str, Any]  # Adam's, by the same names
     second_moments: dict[str, Any]
     ema: Network  # exponential moving average of the actor over updates; the one that is flown
     episodes: Any  # [K, N] as `HostEnvironment` keeps them
-    key: Any  # raw, of starts and noise
+    key: Any  # raw, of initial states and noise
     observation: Any  # [N, 17] last seen
     torch_random: Any  # the state of torch's generator: actions
     numpy_random: Any  # the state of NumPy's: minibatches
@@ -72,26 +70,26 @@ def last_policy(settings: PpoSettings, train_state: TrainState) -> Policy:
 
 
 def start(task: Task, settings: PpoSettings, key: jax.Array) -> TrainState:
-    """A learner before its first update."""
-    with _lent_generators():
-        workbench = _Workbench(task, settings, int(jax.random.bits(key)))
-        taken = workbench.take()
+    """The training state before the first update."""
+    with _restored_generators():
+        model = _Model(task, settings, int(jax.random.bits(key)))
+        fields = model.read()
     return TrainState(
-        workbench=workbench,
-        ema=actor_network(taken["weights"]),
+        model=model,
+        ema=actor_network(fields["weights"]),
         updates=jnp.zeros((), jnp.int32),
-        **taken,
+        **fields,
     )
 
 
 def update(task: Task, settings: PpoSettings, train_state: TrainState) -> tuple[TrainState, dict[str, Any]]:
-    """The learner after one update, and what it saw."""
-    with _lent_generators():
-        train_state.workbench.put(train_state)
-        seen = train_state.workbench.update(train_state)
-        taken = train_state.workbench.take()
-    ema = averaged(train_state.ema, actor_network(taken["weights"]), settings.ema_decay, train_state.updates)
-    return TrainState(workbench=train_state.workbench, ema=ema, updates=train_state.updates + 1, **taken), seen
+    """The training state after one update, and its metrics."""
+    with _restored_generators():
+        train_state.model.load(train_state)
+        metrics = train_state.model.update(train_state)
+        fields = train_state.model.read()
+    ema = averaged(train_state.ema, actor_network(fields["weights"]), settings.ema_decay, train_state.updates)
+    return TrainState(model=train_state.model, ema=ema, updates=train_state.updates + 1, **fields), metrics
 
 
 def make_model(settings: PpoSettings, environments: Any, seed: int) -> Any:
@@ -123,8 +121,8 @@ def make_model(settings: PpoSettings, environments: Any, seed: int) -> Any:
     )
 
 
-class _Workbench:
-    """Stable-Baselines3's model of a training, and the environments it learns in."""
+class _Model:
+    """Stable-Baselines3's model, and the environments that it learns in."""
 
     def __init__(self, task: Task, settings: PpoSettings, seed: int) -> None:
         from flytune.adapters.vec_env import HoverVecEnv
@@ -133,8 +131,8 @@ class _Workbench:
         self.environments = HoverVecEnv(task, settings.environments, seed)
         self.model = make_model(settings, self.environments, seed)
 
-    def put(self, train_state: TrainState) -> None:
-        """Bring model, environments and random numbers to where a learner is."""
+    def load(self, train_state: TrainState) -> None:
+        """Set model, environments and random numbers to a training state."""
         import torch
 
         def tensor(values: Any) -> torch.Tensor:
@@ -152,19 +150,19 @@ class _Workbench:
         }
         network.optimizer.load_state_dict({**network.optimizer.state_dict(), "state": memory})
         environment = self.environments.environment
-        # copies, since the step's compiled code uses their memory again
+        # copies, because the compiled step reuses their memory
         environment.episodes = jnp.array(train_state.episodes)
         environment.key = jax.random.wrap_key_data(jnp.array(train_state.key))
         environment.observation = np.array(train_state.observation)
         numbers = np.array(train_state.numpy_random)
-        # the global one, since it is what Stable-Baselines3 draws from
+        # the global generator, because Stable-Baselines3 draws from it
         np.random.set_state(  # noqa: NPY002
             {"bit_generator": "MT19937", "state": {"key": numbers[:-1], "pos": int(numbers[-1])}}
         )
         torch.set_rng_state(tensor(train_state.torch_random))
 
-    def take(self) -> dict[str, Any]:
-        """Model, environments and random numbers as they are, in copies: the fields of a learner."""
+    def read(self) -> dict[str, Any]:
+        """Copies of model, environments and random numbers: most fields of the training state."""
         import torch
 
         network, environment = self.model.policy, self.environments.environment
@@ -192,7 +190,7 @@ class _Workbench:
         }
 
     def update(self, train_state: TrainState) -> dict[str, Any]:
-        """What was seen in one rollout and its epochs.
+        """The metrics of one rollout and its epochs.
 
         Raises:
             Diverged: the weights stopped being finite.
@@ -207,14 +205,14 @@ class _Workbench:
                 return True
 
         self.model._last_obs = environments.environment.observation
-        # whether a rollout's first step began an episode: kept for those that look further back, and nobody here does
+        # whether an episode starts with the rollout; flytune does not use it, and any value gives the same training
         self.model._last_episode_starts = np.ones(self.settings.environments, bool)
         samples = self.settings.environments * self.settings.rollout
         try:
-            # one rollout and its epochs, so that the second, the first to be logged, never comes
+            # one rollout and its epochs; Stable-Baselines3 would print from the second on
             self.model.learn(samples, Watch(), log_interval=2, reset_num_timesteps=False)
         except (ValueError, RuntimeError) as error:
-            if not any(words in str(error) for words in REFUSALS):
+            if not any(words in str(error) for words in DIVERGENCE):
                 raise
             number = int(train_state.updates) + 1
             raise Diverged(
@@ -222,35 +220,16 @@ class _Workbench:
                 "A smaller learning_rate, or smaller weights in the reward, may help."
             ) from None
         logged = self.model.logger.name_to_value
-        return {**_account(self.task, transitions), **{name: np.asarray(logged[key]) for name, key in LOSSES.items()}}
-
-
-def _account(task: Task, transitions: list[Transition]) -> dict[str, Any]:
-    """The rewards, ends and lengths of a rollout, as `account` gives them for our own trainers."""
-
-    def column(name: str) -> np.ndarray:
-        return np.stack([getattr(transition, name) for transition in transitions])
-
-    ended, cause = column("ended"), column("cause")
-
-    def mean_at_end(values: np.ndarray) -> np.ndarray:
-        return np.asarray(values[ended].mean() if ended.any() else np.nan)
-
-    return {
-        "reward": column("reward").mean(),
-        "terms": {name: np.mean([transition.terms[name] for transition in transitions]) for name in task.reward},
-        "terminations": np.bincount(cause[cause >= 0], minlength=len(causes(task.termination))),
-        "episodes": ended.sum(),
-        "episode_reward": mean_at_end(column("episode_return")),
-        "episode_length": mean_at_end(column("episode_length")),
-    }
+        steps = Transition(**jax.tree.map(lambda *each: np.stack(each), *map(vars, transitions)))
+        metrics = rollout_metrics(self.task, steps, steps.episode_return, steps.episode_length)
+        return metrics | {name: np.asarray(logged[key]) for name, key in LOSSES.items()}
 
 
 @contextlib.contextmanager
-def _lent_generators() -> Iterator[None]:
-    """The process's random numbers and torch's threads, lent to a training and given back as they were.
+def _restored_generators() -> Iterator[None]:
+    """Restores the random generators of the process and torch's number of threads afterwards.
 
-    One thread, so that results repeat bit by bit; at this size more are no faster.
+    torch gets one thread, so that results are the same bit by bit; at this size more threads are no faster.
     """
     import torch
 

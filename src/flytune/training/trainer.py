@@ -41,7 +41,7 @@ class Algorithm(Protocol):
         ...
 
     def update(self, task: Task, settings: Any, train_state: Any) -> tuple[Any, dict[str, Any]]:
-        """The training state after one update, and the metrics of its rollout (see `rollout_metrics`) and its losses."""
+        """The training state after one update, and its metrics: `rollout_metrics` and the losses."""
         ...
 
     def policy(self, settings: Any, train_state: Any) -> Policy:

@@ -1,0 +1,95 @@
+"""The parts of an update that trainers share: the optimiser step, the average of the weights, and the metrics."""
+
+import math
+from typing import Any, TypeVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+from jaxtyping import Array
+
+from flytune.errors import Diverged
+from flytune.simulation.environment import Outcome
+from flytune.simulation.host import Transition
+from flytune.task.task import Task
+from flytune.task.termination import causes
+
+T = TypeVar("T")
+
+
+def descend(optimiser: optax.GradientTransformation, gradient: T, memory: Any, parameters: T) -> tuple[T, Any]:
+    """The parameters and the optimiser's memory after one step against the gradient."""
+    # optax's type of parameters knows arrays and containers, not dataclasses that are pytrees
+    change, memory = optimiser.update(gradient, memory, parameters)  # pyright: ignore[reportArgumentType]
+    return optax.apply_updates(parameters, change), memory  # pyright: ignore[reportArgumentType, reportReturnType]
+
+
+def averaged(ema: T, newest: T, ema_decay: float, updates: Array) -> T:
+    """The moving average of weights: a plain mean over the first updates, then `ema_decay` of the old per update."""
+    share = jnp.minimum(ema_decay, updates / (updates + 1.0))
+    return jax.tree.map(lambda old, new: share * old + (1 - share) * new, ema, newest)
+
+
+def rollout_metrics(
+    task: Task, steps: Outcome | Transition, episode_reward: Any, episode_length: Any
+) -> dict[str, Any]:
+    """The rewards, terminations and lengths of a rollout; a mean over ended episodes is NaN where none ended.
+
+    Args:
+        task: what was flown.
+        steps: the outcome of every step, [time, environment], in arrays of JAX or of NumPy.
+        episode_reward: [time, environment], the sum of the rewards of each episode so far.
+        episode_length: [time, environment], the number of steps of each episode so far.
+    """
+    xp: Any = np if isinstance(steps.reward, np.ndarray) else jnp
+    ended = steps.terminated | steps.truncated
+    number = xp.sum(ended)
+
+    def mean_at_end(values: Any) -> Any:
+        return xp.where(number > 0, xp.sum(xp.where(ended, values, 0)) / xp.maximum(number, 1), xp.nan)
+
+    codes = xp.arange(len(causes(task.termination)))
+    return {
+        "reward": xp.mean(steps.reward),
+        "terms": {name: xp.mean(values) for name, values in steps.terms.items()},
+        "terminations": xp.sum(steps.cause[..., None] == codes, axis=(0, 1)),
+        "episodes": number,
+        "episode_reward": mean_at_end(episode_reward),
+        "episode_length": mean_at_end(episode_length),
+    }
+
+
+def metrics_row(task: Task, measured: dict[str, Any], update: int, steps: int, seconds: float) -> dict[str, Any]:
+    """The row of metrics.jsonl of one update; a mean over episodes is None where no episode ended.
+
+    Args:
+        task: what is trained.
+        measured: what the update measured, see `rollout_metrics`, and its losses.
+        update: its number, 1 for the first.
+        steps: environment steps of the training so far.
+        seconds: of the training so far.
+
+    Raises:
+        Diverged: a number is not finite.
+    """
+    values = jax.tree.map(np.asarray, measured)
+
+    def number(value: np.ndarray) -> float | None:
+        return float(value) if np.isfinite(value) else None
+
+    row: dict[str, Any] = {"update": update, "steps": steps, "seconds": round(seconds, 3)}
+    row["episode_reward"] = number(values.pop("episode_reward"))
+    row["reward"] = float(values.pop("reward"))
+    row["terms"] = {name: float(value) for name, value in values.pop("terms").items()}
+    row["terminations"] = dict(zip(causes(task.termination), map(int, values.pop("terminations")), strict=True))
+    row["episodes"] = int(values.pop("episodes"))
+    row["episode_length"] = number(values.pop("episode_length"))
+    row |= {name: float(value) for name, value in sorted(values.items())}
+    for name, value in row.items():
+        if isinstance(value, float) and not math.isfinite(value):
+            raise Diverged(
+                f"training: {name} is {value} in update {update} ({steps} environment steps). "
+                "A smaller learning_rate, or smaller weights in the reward, may help."
+            )
+    return row
