@@ -24,16 +24,16 @@ samples = task.ppo.environments * task.ppo.rollout
 alone = partial(ppo.update, task, task.ppo)
 together = jax.jit(jax.vmap(alone), donate_argnums=0)
 keys = jax.random.split(jax.random.key(0), SEEDS)
-learners = {
+train_states = {
     "one seed": ppo.start(task, task.ppo, keys[0]),
     f"{SEEDS} seeds in one program": jax.vmap(partial(ppo.start, task, task.ppo))(keys),
 }
 updates = {"one seed": (alone, 1), f"{SEEDS} seeds in one program": (together, SEEDS)}
-best = dict.fromkeys(learners, float("inf"))
+best = dict.fromkeys(train_states, float("inf"))
 for turn in range(REPEATS + 1):
     for name, (update, number) in updates.items():
         started = time.perf_counter()
-        learners[name], seen = update(learners[name])
+        train_states[name], seen = update(train_states[name])
         jax.block_until_ready(seen)
         if turn:  # the first compiles
             best[name] = min(best[name], (time.perf_counter() - started) / number)

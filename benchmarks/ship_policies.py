@@ -4,8 +4,8 @@
     flytune reproduce --refined --trainer ppo --out refined-ppo
     python benchmarks/ship_policies.py refined-apg refined-ppo
 
-Best is the seed with most feasible trials settled on all axes, and of these the one with the smallest median error of
-position; what counts is the policy that is flown by default, on trials that neither training nor `evaluate` uses.
+The best seed is the one with the most feasible trials settled on all axes; among equals, the one with the smallest median
+position error. The script flies the averaged policy, on trials that neither training nor `evaluate` uses.
 """
 
 import argparse
@@ -22,11 +22,11 @@ from flytune.reproduction.study import BEHAVIOURS, Study
 from flytune.runs.directory import read_facts
 from flytune.runs.shipped import HOME
 
-SEED = 1000  # of starts and noise; evaluations use 1
+SEED = 1000  # of initial conditions and noise; evaluations use 1
 
 
 def quality(directory: Path, study: Study, behaviour: str) -> tuple[int, float]:
-    """More is better: feasible trials settled on all axes, and the median error with its sign turned."""
+    """The number of feasible trials settled on all axes, and minus the median position error; larger is better."""
     judgement = judge(fly(load_policy(directory / "policy.safetensors"), study.task(behaviour), trials=200, seed=SEED))
     settled = np.all([np.isfinite(judgement.settling_time[axis]) for axis in AXES], axis=0)
     return int(np.sum(settled & ~judgement.infeasible)), -float(np.median(judgement.steady_state_error["position"]))
@@ -45,7 +45,7 @@ def ship(folder: Path, commit: str | None) -> None:
         target.mkdir(exist_ok=True)
         shutil.copyfile(best.directory / "policy.safetensors", target / f"{stem}.safetensors")
         facts = read_facts(best.directory)
-        # the study's workers were told in files of their own; this gives the same policy bit by bit
+        # the study's own command names a task file; this command gives the same policy bit by bit
         facts["command"] = f"flytune train {best.preset} --trainer {study.trainer} --seed {best.seed}".split()
         facts["commit"] = facts["commit"] or commit
         (target / f"{stem}.json").write_text(json.dumps(facts, indent=2) + "\n", encoding="utf-8")

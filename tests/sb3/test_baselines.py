@@ -12,8 +12,8 @@ from flytune.benchmark import baselines
 from flytune.task.task import load_task
 
 
-def contender(what, run=lambda: None, extras=()):
-    return baselines.Contender(
+def case(what, run=lambda: None, extras=()):
+    return baselines.Case(
         what=what, environments=4, steps=1024, extras=extras, prepare=lambda: contextlib.nullcontext(run)
     )
 
@@ -21,11 +21,13 @@ def contender(what, run=lambda: None, extras=()):
 @pytest.mark.parametrize(("package", "extras"), [("pybullet", ("pybullet", "sb3")), ("stable_baselines3", ("sb3",))])
 def test_what_is_not_installed_is_named_with_its_command_and_has_no_rate(monkeypatch, package, extras):
     monkeypatch.setitem(sys.modules, package, None)
-    lacking, there = baselines.measure([contender("A on B", extras=extras), contender("B")])
+    lacking, there = baselines.measure([case("A on B", extras=extras), case("B")])
     command = f'pip install "flytune[{",".join(extras)}]"'
     assert (lacking.steps_per_second, lacking.ratio, lacking.missing) == (None, None, command)
-    assert "not installed" in lacking.line() and command in lacking.line() and "4 x 1024" in lacking.line()
-    assert there.steps_per_second > 0 and there.ratio is None and "steps/s" in there.line()
+    assert there.steps_per_second > 0 and there.ratio is None
+    _, line, other = str(baselines.measurements_table([lacking, there])).splitlines()
+    assert line.split() == ["A", "on", "B", "4", "1024", "1", "-", "-", "not", "installed:", *command.split()]
+    assert other.split() == ["B", "4", "1024", "1", f"{there.steps_per_second:,.0f}", "-"]
 
 
 def test_rates_are_those_of_the_fastest_repetition_and_ratios_are_to_the_first():
@@ -37,18 +39,19 @@ def test_rates_are_those_of_the_fastest_repetition_and_ratios_are_to_the_first()
             nonlocal now
             now += next(durations[name])
 
-        return contender(name, run, extras=("sb3",))
+        return case(name, run, extras=("sb3",))
 
     slow, fast = baselines.measure([taking("slow"), taking("fast")], clock=lambda: now)
     # 4 x 1024 steps in 2 s and in 0.5 s; the first repetition compiles and does not count, however short it is
     assert (slow.steps_per_second, fast.steps_per_second) == (2048, 8192)
     assert (slow.ratio, fast.ratio) == (1, 4)
-    assert "8,192 steps/s" in fast.line() and "4.0 x" in fast.line()
+    lines = str(baselines.measurements_table([slow, fast])).splitlines()
+    assert [line.split()[4:] for line in lines[1:]] == [["2,048", "1.0", "x"], ["8,192", "4.0", "x"]]
 
 
 def test_measurements_take_turns():
     order = []
-    baselines.measure([contender(name, lambda name=name: order.append(name)) for name in "ab"])
+    baselines.measure([case(name, lambda name=name: order.append(name)) for name in "ab"])
     assert order == list("ab" * (1 + baselines.ROUNDS))
 
 

@@ -1,4 +1,4 @@
-"""Throughput beside what people use today: Stable-Baselines3 and PyBullet, measured on this machine in the same run."""
+"""The throughput of the usual software, Stable-Baselines3 and PyBullet, measured on this machine beside flytune's."""
 
 # pyright: reportMissingImports=false
 # PyTorch is in no pinned requirement; without it the rest is checked all the same
@@ -6,7 +6,7 @@
 import contextlib
 import dataclasses
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from typing import Any
 
@@ -14,43 +14,37 @@ import numpy as np
 
 from flytune.errors import BadInput
 from flytune.extras import require
+from flytune.tables import NULL, Column, Table
 from flytune.task.task import Task
 
 PROCESSES = 4  # of the baseline (paper R18)
-ROUNDS, LONGEST = 5, 120.0  # each round runs every contender once, so that other work on the machine slows all; s
+ROUNDS, LONGEST = 5, 120.0  # rounds and seconds at most; a round runs each case once, so that other load is shared
 ROLLOUT = 1024  # steps per environment and update with 4 environments; the paper's 4,096 give the same rate
 STEPS = 2000  # per environment in one repetition of a simulation
 
 PACKAGES = {"pybullet": ("pybullet", "gymnasium"), "sb3": ("torch", "stable_baselines3"), "gymnasium": ("gymnasium",)}
 
 Repeat = Callable[[], Any]  # one repetition of a measurement
-Environments = Callable[[int], contextlib.AbstractContextManager[Any]]  # so many, in a vector of SB3's kind
+# number -> a vector environment for Stable-Baselines3
+Environments = Callable[[int], contextlib.AbstractContextManager[Any]]
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Row:
-    """One measurement; `ratio` is to the baseline, the first row of its kind."""
+class Measurement:
+    """The throughput of one case; `ratio` is to the first case, the baseline."""
 
     what: str
     environments: int
     steps: int  # per environment in one update, or in one repetition
-    processes: int  # that simulate
+    processes: int  # simulating processes
     steps_per_second: float | None
     ratio: float | None = None
-    missing: str | None = None  # the command that installs what this needs, where it is not installed
-
-    def line(self) -> str:
-        """The measurement for a terminal."""
-        shape = f"{self.environments:4} x {self.steps:<5} {self.processes} proc."
-        if self.steps_per_second is None:
-            return f"{self.what:38} {shape}   not installed: {self.missing}"
-        ratio = "" if self.ratio is None else f"   {self.ratio:8.1f} x"
-        return f"{self.what:38} {shape}   {self.steps_per_second:10,.0f} steps/s{ratio}"
+    missing: str | None = None  # the command that installs a missing package
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Contender:
-    """What is to be measured: its shape as in `Row`, the extras it needs, and how it is set up."""
+class Case:
+    """One case of a benchmark: fields as of `Measurement`, the extras that it needs, and the function that prepares it."""
 
     what: str
     environments: int
@@ -60,45 +54,59 @@ class Contender:
     prepare: Callable[[], contextlib.AbstractContextManager[Repeat]]
 
 
-def compare_training(task: Task, own: Repeat) -> list[Row]:
-    """Training by Stable-Baselines3 on PyBullet and on our environments, and by our own PPO, whose update is `own`."""
+def measurements_table(measurements: Sequence[Measurement]) -> Table:
+    """The measurements as a table."""
+    return Table.of(
+        [
+            Column("", lambda each: each.what, align="left"),
+            Column("environments", lambda each: each.environments),
+            Column("steps", lambda each: each.steps),
+            Column("processes", lambda each: each.processes),
+            Column("steps/s", lambda each: f"{each.steps_per_second:,.0f}" if each.steps_per_second else NULL),
+            Column("ratio", lambda each: f"{each.ratio:.1f} x" if each.ratio else NULL),
+            Column("", lambda each: f"not installed: {each.missing}" if each.missing else "", align="left"),
+        ],
+        measurements,
+    )
+
+
+def compare_training(task: Task, own: Repeat) -> list[Measurement]:
+    """Training by Stable-Baselines3 on PyBullet and on flytune's environments, and by flytune's PPO (`own`: one update)."""
     number, rollout = task.ppo.environments, task.ppo.rollout
     elsewhere, here = partial(_pybullet_processes, task), partial(_own_environments, task)
 
-    def contender(what: str, environments: Environments, number: int, steps: int, **options: Any) -> Contender:
+    def case(what: str, environments: Environments, number: int, steps: int, **options: Any) -> Case:
         prepare = partial(_training, task, environments, number, steps)
-        return Contender(what=what, environments=number, steps=steps, prepare=prepare, **options)
+        return Case(what=what, environments=number, steps=steps, prepare=prepare, **options)
 
     both, sb3 = ("pybullet", "sb3"), ("sb3",)
     return measure(
         [
-            contender("SB3 PPO on PyBullet", elsewhere, PROCESSES, ROLLOUT, processes=PROCESSES, extras=both),
-            contender("SB3 PPO on flytune", here, PROCESSES, ROLLOUT, extras=sb3),
-            contender("SB3 PPO on flytune", here, number, rollout, extras=sb3),
-            Contender(what="flytune PPO", environments=number, steps=rollout, prepare=lambda: _ready(own)),
+            case("SB3 PPO on PyBullet", elsewhere, PROCESSES, ROLLOUT, processes=PROCESSES, extras=both),
+            case("SB3 PPO on flytune", here, PROCESSES, ROLLOUT, extras=sb3),
+            case("SB3 PPO on flytune", here, number, rollout, extras=sb3),
+            Case(what="flytune PPO", environments=number, steps=rollout, prepare=lambda: _ready(own)),
         ]
     )
 
 
-def compare_simulation(task: Task, own: Repeat, own_shape: tuple[int, int]) -> list[Row]:
-    """Simulation in PyBullet, by our environments for other people's trainers, and compiled as a whole (`own`)."""
+def compare_simulation(task: Task, own: Repeat, own_shape: tuple[int, int]) -> list[Measurement]:
+    """Simulation in PyBullet, in flytune's environments for other packages, and compiled as a whole (`own`)."""
     width = task.ppo.environments
 
-    def contender(what: str, number: int, prepare: Any, *extras: str, processes: int = 1) -> Contender:
-        return Contender(
-            what=what, environments=number, steps=STEPS, prepare=prepare, extras=extras, processes=processes
-        )
+    def case(what: str, number: int, prepare: Any, *extras: str, processes: int = 1) -> Case:
+        return Case(what=what, environments=number, steps=STEPS, prepare=prepare, extras=extras, processes=processes)
 
     processes = partial(_stepping, partial(_pybullet_processes, task), PROCESSES)
     vector = partial(_stepping, partial(_own_environments, task), width)
     return measure(
         [
-            contender("PyBullet, SubprocVecEnv", PROCESSES, processes, "pybullet", "sb3", processes=PROCESSES),
-            contender("PyBullet, Gymnasium", 1, partial(_one, task, "pybullet"), "pybullet"),
-            contender("PyBullet alone, no rewards", 1, partial(_alone, task), "pybullet"),
-            contender("flytune, Gymnasium", 1, partial(_one, task, "flytune"), "gymnasium"),
-            contender("flytune, VecEnv", width, vector, "sb3"),
-            Contender(
+            case("PyBullet, SubprocVecEnv", PROCESSES, processes, "pybullet", "sb3", processes=PROCESSES),
+            case("PyBullet, Gymnasium", 1, partial(_one, task, "pybullet"), "pybullet"),
+            case("PyBullet alone, no rewards", 1, partial(_alone, task), "pybullet"),
+            case("flytune, Gymnasium", 1, partial(_one, task, "flytune"), "gymnasium"),
+            case("flytune, VecEnv", width, vector, "sb3"),
+            Case(
                 what="flytune, compiled",
                 environments=own_shape[0],
                 steps=own_shape[1],
@@ -108,41 +116,40 @@ def compare_simulation(task: Task, own: Repeat, own_shape: tuple[int, int]) -> l
     )
 
 
-def measure(contenders: list[Contender], clock: Callable[[], float] = time.perf_counter) -> list[Row]:
-    """A row for each contender: the fastest of its repetitions, and its ratio to the first.
+def measure(cases: list[Case], clock: Callable[[], float] = time.perf_counter) -> list[Measurement]:
+    """The throughput of each case in the fastest of its repetitions, and its ratio to the first case.
 
     Args:
-        contenders: what to measure, in the order of the rows.
+        cases: what to measure.
         clock: gives the time now in seconds.
     """
-    missing = [_missing(contender.extras) for contender in contenders]
+    missing = [_missing(case.extras) for case in cases]
     with contextlib.ExitStack() as stack:
         runs = [
-            None if lacks else stack.enter_context(contender.prepare())
-            for contender, lacks in zip(contenders, missing, strict=True)
+            None if lacks else stack.enter_context(case.prepare()) for case, lacks in zip(cases, missing, strict=True)
         ]
-        fastest = _fastest([run for run in runs if run is not None], clock)
-    seconds = [fastest.pop(0) if run is not None else None for run in runs]
+        shortest = fastest([run for run in runs if run is not None], clock)
+    seconds = [shortest.pop(0) if run is not None else None for run in runs]
     rates = [
-        None if time_ is None else contender.environments * contender.steps / time_
-        for contender, time_ in zip(contenders, seconds, strict=True)
+        None if time_ is None else case.environments * case.steps / time_
+        for case, time_ in zip(cases, seconds, strict=True)
     ]
     return [
-        Row(
-            what=contender.what,
-            environments=contender.environments,
-            steps=contender.steps,
-            processes=contender.processes,
+        Measurement(
+            what=case.what,
+            environments=case.environments,
+            steps=case.steps,
+            processes=case.processes,
             steps_per_second=rate,
             ratio=rate / rates[0] if rate and rates[0] else None,
             missing=lacks,
         )
-        for contender, rate, lacks in zip(contenders, rates, missing, strict=True)
+        for case, rate, lacks in zip(cases, rates, missing, strict=True)
     ]
 
 
 def _missing(extras: tuple[str, ...]) -> str | None:
-    """The command that installs what of some extras is not there, or None."""
+    """The command that installs some extras, or None where they are installed."""
     try:
         for extra in extras:
             for package in PACKAGES[extra]:
@@ -152,8 +159,11 @@ def _missing(extras: tuple[str, ...]) -> str | None:
     return None
 
 
-def _fastest(runs: list[Repeat], clock: Callable[[], float]) -> list[float]:
-    """Seconds of the fastest repetition of each, after one that is not counted."""
+def fastest(runs: Sequence[Repeat], clock: Callable[[], float] = time.perf_counter) -> list[float]:
+    """Seconds of the fastest repetition of each function; a first repetition, which compiles, does not count.
+
+    Other load on the machine only ever makes a repetition slower.
+    """
     for run in runs:
         run()
     best, began = [float("inf")] * len(runs), clock()
@@ -168,7 +178,7 @@ def _fastest(runs: list[Repeat], clock: Callable[[], float]) -> list[float]:
 
 
 def make_environment(task: Task) -> Any:
-    """The baseline's environment: ours for Gymnasium with PyBullet's physics, monitored as SB3 would."""
+    """The environment of the baseline: flytune's for Gymnasium with PyBullet's physics, in Stable-Baselines3's monitor."""
     from stable_baselines3.common.monitor import Monitor
 
     from flytune.adapters.gymnasium import HoverEnv
@@ -250,7 +260,7 @@ def _one(task: Task, simulator: str) -> Iterator[Repeat]:
 
 @contextlib.contextmanager
 def _alone(task: Task) -> Iterator[Repeat]:
-    """Steps of PyBullet's physics, without what makes an environment of it."""
+    """Steps of PyBullet's physics, without an environment around it."""
     from flytune.simulation.simulators import make_simulator
 
     simulator, actions = make_simulator("pybullet", task.vehicle, 1), _actions(1)

@@ -1,16 +1,22 @@
-"""Throughput on this machine, as ratios measured in one run, since a time alone says more about the machine."""
+"""Throughput on this machine. The ratios matter: they are measured in one run, and depend less on the machine."""
 
 import dataclasses
 import itertools
 import os
-import time
 from collections.abc import Callable
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 
-from flytune.benchmark.baselines import Row, compare_simulation, compare_training
+from flytune.benchmark.baselines import (
+    Measurement,
+    compare_simulation,
+    compare_training,
+    fastest,
+    measurements_table,
+)
+from flytune.errors import BadInput
 from flytune.simulation.environment import Episode
 from flytune.simulation.rollout import Draw, reset_all, rollout
 from flytune.task.observation import NOISY
@@ -20,20 +26,20 @@ from flytune.training.trainer import TRAINERS, Trainer
 
 BATCH, WIDTH = 128, 64  # of the matrix product everything is compared with: 128 x 64 times 64 x 64, float32
 SIMULATED = 1024, 200  # environments and steps of a compiled simulation
-REPEATS = 5  # the fastest counts: other work on the machine only ever slows a run down
+PARTS = ("all", "train", "simulate")
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Throughput:
-    """What was measured; rates in environment steps per second."""
+    """The result of a benchmark; rates in environment steps per second, None where not measured."""
 
     matrix_product: float  # floating-point operations per second
     ppo: float | None
     ppo_share_of_limit: float | None  # of what the matrix product alone would allow
     apg: float | None
     simulate: float | None
-    training: list[Row] | None  # beside Stable-Baselines3 and PyBullet
-    simulation: list[Row] | None
+    training: list[Measurement] | None  # beside Stable-Baselines3 and PyBullet
+    simulation: list[Measurement] | None
     device: str
     cores: int | None
 
@@ -56,31 +62,38 @@ class Throughput:
             lines.append(f"train apg (forward and backward)           {self.apg:10,.0f} steps/s")
         if self.simulate is not None:
             lines.append(f"simulate (observe, step, reward, reset)    {self.simulate:10,.0f} steps/s")
-        for title, rows in (("training", self.training), ("simulation", self.simulation)):
-            if rows is not None:
-                heading = f"{title} (environments x steps, processes that simulate; ratio to the first row)"
-                lines += ["", heading, *(f"  {row.line()}" for row in rows)]
+        for title, measurements in (("training", self.training), ("simulation", self.simulation)):
+            if measurements is not None:
+                heading = f"{title} (steps of each environment; ratio to the first row)"
+                lines += ["", heading, str(measurements_table(measurements))]
         return "\n".join(lines)
 
 
 def bench(what: str = "all") -> Throughput:
-    """Throughput of training and of simulation, beside a plain matrix product and what else is installed.
+    """The throughput of training and of simulation, beside a matrix product, Stable-Baselines3 and PyBullet.
+
+    Packages that are not installed are left out and named. Everything takes a few minutes.
 
     Args:
         what: `train`, `simulate` or `all`.
+
+    Raises:
+        BadInput: something else.
     """
+    if what not in PARTS:
+        raise BadInput(f"what: {what!r} is not allowed. Allowed: {', '.join(PARTS)}.")
     task = load_task("baseline")
     training, simulation = what in ("all", "train"), what in ("all", "simulate")
     product = _matrix_product()
     ppo_update, fly = _training(TRAINERS["ppo"], task), _simulation(task)
-    ppo_rate = task.ppo.steps_per_update / _fastest(ppo_update) if training else None
-    product = max(product, _matrix_product())  # the limit is what the machine can do undisturbed
+    ppo_rate = task.ppo.steps_per_update / _seconds(ppo_update) if training else None
+    product = max(product, _matrix_product())  # the better of two, as other load disturbs it
     return Throughput(
         matrix_product=product,
         ppo=ppo_rate,
         ppo_share_of_limit=ppo_rate * operations_per_step(task.ppo) / product if ppo_rate else None,
-        apg=task.apg.steps_per_update / _fastest(_training(TRAINERS["apg"], task)) if training else None,
-        simulate=SIMULATED[0] * SIMULATED[1] / _fastest(fly) if simulation else None,
+        apg=task.apg.steps_per_update / _seconds(_training(TRAINERS["apg"], task)) if training else None,
+        simulate=SIMULATED[0] * SIMULATED[1] / _seconds(fly) if simulation else None,
         training=compare_training(task, ppo_update) if training else None,
         simulation=compare_simulation(task, fly, SIMULATED) if simulation else None,
         device=jax.devices()[0].platform,
@@ -100,14 +113,8 @@ def operations_per_step(settings: PpoSettings) -> float:
     return 2.0 * (3 * settings.epochs * (actor + critic) + actor + 2 * critic)
 
 
-def _fastest(run: Callable[[], Any]) -> float:
-    run()
-    times = []
-    for _ in range(REPEATS):
-        started = time.perf_counter()
-        run()
-        times.append(time.perf_counter() - started)
-    return min(times)
+def _seconds(run: Callable[[], Any]) -> float:
+    return fastest([run])[0]
 
 
 def _matrix_product() -> float:
@@ -119,7 +126,7 @@ def _matrix_product() -> float:
     def chain(first: jax.Array) -> jax.Array:
         return jax.lax.scan(lambda x, _: (x @ second, None), first, length=number)[0]
 
-    return 2.0 * BATCH * WIDTH * WIDTH * number / _fastest(lambda: jax.block_until_ready(chain(first)))
+    return 2.0 * BATCH * WIDTH * WIDTH * number / _seconds(lambda: jax.block_until_ready(chain(first)))
 
 
 def _training(trainer: Trainer, task: Task) -> Callable[[], Any]:
