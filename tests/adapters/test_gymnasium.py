@@ -394,7 +394,7 @@ def test_a_picture_nobody_asked_for_is_warned_of(make):
 
 
 def test_every_example_of_the_page_runs(tmp_path):
-    page = (ROOT / "docs" / "gymnasium.md").read_text(encoding="utf-8")
+    page = (ROOT / "docs" / "how-to" / "gymnasium.md").read_text(encoding="utf-8")
     examples = re.findall(r"```python\n(.*?)```", page, flags=re.DOTALL)
     assert len(examples) >= 3
     for example in examples:
