@@ -93,13 +93,17 @@ def _boxes(
     """Boxes per axis and behaviour over all seeds and trials; above each, the share of the trials that it shows."""
     figure, panels = _canvas(2, 2, 4.0)
     for axes, axis in zip(panels, AXES, strict=True):
+        drawn = False
         for place, behaviour in enumerate(BEHAVIOURS):
             judged = evidence.response(behaviour, weights, setting).judgements
             values = np.concatenate([metric(judgement, axis) for judgement in judged])
-            share = f"{_box(axes, values, place, COLOURS[behaviour]):.0%}"
-            axes.annotate(share, (place, 1.0), xycoords=("data", "axes fraction"), ha="center", va="bottom", fontsize=6)
+            share = _box(axes, values, place, COLOURS[behaviour])
+            drawn |= share > 0
+            axes.annotate(
+                f"{share:.0%}", (place, 1.0), xycoords=("data", "axes fraction"), ha="center", va="bottom", fontsize=6
+            )
         axes.set_title(axis, pad=12)
-        if logarithmic:
+        if logarithmic and drawn:  # a logarithmic axis without a value cannot be drawn
             axes.set_yscale("log")
         else:
             axes.set_ylim(bottom=0)
