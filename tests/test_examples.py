@@ -16,6 +16,7 @@ SMALL = {
     "own_controller": ("--trials", "4"),
     "own_reward_term": ("--updates", "2", "--trials", "4"),
     "train_and_judge": ("--updates", "2", "--trials", "4"),
+    "tune_to_a_response": ("--settling-time", "3"),
     "write_a_report": ("--trials", "4"),
 }
 NEEDS = {"export_to_onnx": "onnxruntime", "gymnasium_loop": "gymnasium", "other_simulator": "pybullet"}
@@ -28,6 +29,7 @@ SHOWS = {
     "own_controller": "switched on baseline-refined (crazyflie",
     "own_reward_term": "'vertical_speed': -",
     "train_and_judge": "crashed",
+    "tune_to_a_response": "\nmet\n",
     "write_a_report": "open report.html in a browser",
 }
 
