@@ -41,7 +41,7 @@ DOCS = HERE / "docs" / "results" / "heuristics"
 
 def jobs(seeds: int) -> list[tuple[str | None, float | None, int]]:
     """Every training: parameter, value, seed; the unchanged task once per seed."""
-    from flytune.config.document import plain
+    from flytune.config.writing import plain
     from flytune.task.task import load_task
     from flytune.tuning.rules import number_at
 
@@ -64,6 +64,7 @@ def file_of(folder: Path, job: tuple[str | None, float | None, int]) -> Path:
 
 def measure_one(folder: Path, updates: int, job: tuple[str | None, float | None, int]) -> None:
     """Train one task and write its response to a file."""
+    from flytune.config.files import write_json
     from flytune.control.policy import load_policy
     from flytune.errors import Diverged
     from flytune.evaluation.fly import fly
@@ -97,9 +98,7 @@ def measure_one(folder: Path, updates: int, job: tuple[str | None, float | None,
     except Diverged as error:
         row["diverged"] = str(error)
     path = file_of(folder, job)
-    whole = path.with_suffix(".part")
-    whole.write_text(json.dumps(row), encoding="utf-8")
-    whole.replace(path)
+    write_json(path, row)
     print(
         f"{path.stem}: {row['settled']} settled, {row['settling_time']} s ({time.monotonic() - began:.0f} s)",
         flush=True,
@@ -119,7 +118,7 @@ def measure(folder: Path, updates: int, seeds: int, workers: int) -> None:
         with multiprocessing.get_context("spawn").Pool(workers) as pool:
             pool.starmap(measure_one, missing, chunksize=1)
 
-    from flytune.config.document import plain
+    from flytune.config.writing import plain
     from flytune.task.task import load_task
     from flytune.tuning.rules import number_at
 

@@ -75,7 +75,8 @@ def solve(folder: Path, index: int, method: str, seed: int) -> None:
     """Try one requirement with one method, and write the result to a file."""
     import jax
 
-    from flytune.config.document import plain
+    from flytune.config.files import write_json
+    from flytune.config.writing import plain
     from flytune.control.policy import Policy, load_policy
     from flytune.errors import BadInput
     from flytune.task.task import Task
@@ -130,9 +131,7 @@ def solve(folder: Path, index: int, method: str, seed: int) -> None:
         row |= {"met": met, "trainings": len(trainings), "seconds": round(elsewhere + sum(trainings), 1), "said": said}
     shutil.rmtree(work, ignore_errors=True)
     path = folder / f"{name_of(index)}-{method}-{seed}.json"
-    whole = path.with_suffix(".part")
-    whole.write_text(json.dumps(row, indent=1), encoding="utf-8")
-    whole.replace(path)
+    write_json(path, row)
     print(path.stem, row.get("met", "refused"), row.get("trainings", ""), f"{row['seconds']} s", flush=True)
 
 
@@ -187,7 +186,8 @@ def search(tuner: Any, method: str, seed: int) -> bool:
 
 def summary(folder: Path) -> str:
     """The results as Markdown: success and median per method, then every requirement."""
-    from flytune.evaluation.statistics import bootstrap_interval
+    from flytune.evaluation.statistics import bootstrap_interval, median
+    from flytune.tables import Table
 
     rows = [json.loads(path.read_text(encoding="utf-8")) for path in sorted(folder.glob("*-*.json"))]
     methods = [method for method in ("tuner", "tpe", "random") if any(row["method"] == method for row in rows)]
@@ -200,12 +200,7 @@ def summary(folder: Path) -> str:
         (f"{title}, where the start does not meet it", [row for row in chosen if row["requirement"] in hard])
         for title, chosen in groups
     ]
-    lines = [
-        "# The tuner beside two searches: every requirement",
-        "",
-        "| | met | trainings until met, median [95 % interval] | seconds until met, median [95 % interval] |",
-        "|---|---|---|---|",
-    ]
+    overall = []
     for title, chosen in groups:
         mine = [row for row in chosen if "refused" not in row]
         cells = []
@@ -216,12 +211,11 @@ def summary(folder: Path) -> str:
                 for one in asked
             ]
             low, high = bootstrap_interval(needed)  # over requirements, then over the seeds of each
-            middle = np.sort(np.concatenate(needed))[(len(mine) - 1) // 2]
-            told = ["never" if end is None or math.isinf(end) else f"{end:.0f}" for end in (middle, low, high)]
+            ends = (median(np.concatenate(needed)), low, high)
+            told = ["never" if end is None else f"{end:.0f}" for end in ends]
             cells.append(f"{told[0]} [{told[1]} to {told[2]}]")
-        lines.append(f"| {title} | {sum(row['met'] for row in mine)} of {len(mine)} | {' | '.join(cells)} |")
-    lines += ["", 'Trainings of each seed; "-": not met with twelve.', ""]
-    lines += [f"| requirement | {' | '.join(methods)} |", f"|---|{'---|' * len(methods)}"]
+        overall.append((title, f"{sum(row['met'] for row in mine)} of {len(mine)}", *cells))
+    single = []
     for index in range(len(GRID)):
         cells = []
         for method in methods:
@@ -229,8 +223,15 @@ def summary(folder: Path) -> str:
             cells.append(
                 ", ".join("refused" if "refused" in r else f"{r['trainings']}" if r["met"] else "-" for r in mine)
             )
-        lines.append(f"| {title_of(index)} | {' | '.join(cells)} |")
-    return "\n".join(lines) + "\n"
+        single.append((title_of(index), *cells))
+    until = [f"{name} until met, median [95 % interval]" for name in ("trainings", "seconds")]
+    parts = [
+        "# The tuner beside two searches: every requirement",
+        Table.plain(("", "met", *until), overall).markdown(),
+        'Trainings of each seed; "-": not met with twelve.',
+        Table.plain(("requirement", *methods), single).markdown(),
+    ]
+    return "\n\n".join(parts) + "\n"
 
 
 if __name__ == "__main__":

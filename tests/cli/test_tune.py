@@ -51,7 +51,7 @@ def test_a_known_response_is_found_at_once_and_flies_everywhere_a_run_does(tmp_p
 
 
 def test_what_cannot_be_met_ends_with_code_4_the_reason_and_the_best_so_far(tmp_path):
-    arguments = ["tune", "baseline-refined", "--settling-time", "6", "--steps", "1", "--set", "apg.updates=1"]
+    arguments = ["tune", "baseline-refined", "--settling-time", "6", "--iterations", "1", "--set", "apg.updates=1"]
     answer = flytune(*arguments, "--out", "mine", cwd=tmp_path, expect=4)
     assert answer.stdout.splitlines()[-1] == "mine"
     assert answer.stderr.splitlines()[-1].startswith("not met: ")

@@ -47,7 +47,9 @@ class TuneOptions:
             "the others start from new weights"
         ),
     ] = DEFAULT_TRAINER
-    steps: Annotated[Whole, Parameter(help="largest number of edits")] = 12
+    iterations: Annotated[
+        Whole, Parameter(name=("--iterations", "--steps"), help="largest number of edits, each with a training")
+    ] = 12
     seed: Annotated[Whole, Parameter(help="seed of the trainings")] = 0
     out: Annotated[Folder, Parameter(help="run directory (default: a new one under runs/)")] = None
     resume: Annotated[Flag, Parameter(help="continue the tuning in --out")] = False
@@ -72,7 +74,7 @@ def tune(task: TuneTask = None, /, *, options: TuneOptions) -> None:
             options.settling_time, overshoot=options.overshoot, error=options.error, axis=options.axis,
             percentile=options.percentile, at_most=options.at_most, tolerance=options.tolerance, task=task,
             edits=assignments(options.edits), rules=options.rules, trainer=options.trainer, seed=options.seed,
-            most_iterations=options.steps, out=options.out, resume=options.resume,
+            most_iterations=options.iterations, out=options.out, resume=options.resume,
             on_message=lambda line: print(line, flush=True), on_progress=on_progress,
         )  # fmt: skip
     print(result.directory)

@@ -8,6 +8,7 @@ import matplotlib as mpl
 from matplotlib.figure import Figure
 
 from flytune.report.style import HAIRLINE, QUIET, TRIALS
+from flytune.tables import Cell, Table
 from flytune.tuning.sensitivity import Point, Sensitivities
 
 MEASURES = (
@@ -41,19 +42,21 @@ def heuristics_tables(sensitivities: Sensitivities) -> str:
         ends = [_said(measure, point.median(measure, axis)) for point in (points[0], points[-1])]
         outcome = sensitivities.check_claim(parameter, measure, direction, axis)  # pyright: ignore[reportArgumentType]
         span = f"{points[0].value:g} to {points[-1].value:g}"
-        rows.append((item, claim, f"`{parameter}` {span}", f"{ends[0]} to {ends[1]}", f"**{outcome}**"))
+        rows.append(
+            (item, claim, f"`{parameter}` {span}", f"{ends[0]} to {ends[1]}", Cell(text=outcome, tone="strong"))
+        )
     parts = [
         "## The paper's claims",
-        _table(("item", "claim", "parameter", "measured", "outcome"), rows),
+        Table.plain(("item", "claim", "parameter", "measured", "outcome"), rows).markdown(),
         "## Every parameter",
     ]
     for parameter, curve in sensitivities.parameters.items():
         parts.append(f"### `{parameter}`, {curve.baseline:g} in the baseline")
         parts.append(
-            _table(
+            Table.plain(
                 ("value", "settled", *(title for _, title, _ in MEASURES), "speed bound crossed"),
                 [_row(point, curve.baseline) for point in curve.points],
-            )
+            ).markdown()
         )
     return "\n\n".join(parts) + "\n"
 
@@ -90,12 +93,12 @@ def draw_sensitivities(path: Path, sensitivities: Sensitivities) -> None:
         figure.savefig(path, format="svg", metadata={"Date": None})
 
 
-def _row(point: Point, baseline: float) -> tuple[str, ...]:
+def _row(point: Point, baseline: float) -> tuple[str | Cell, ...]:
     settled = [result.settled for result in point.seeds]
     crossed = [
         sum(n for name, n in result.details.get("violations", {}).items() if "speed" in name) for result in point.seeds
     ]
-    value = f"**{point.value:g}**" if point.value == baseline else f"{point.value:g}"
+    value = Cell(text=f"{point.value:g}", tone="strong" if point.value == baseline else "")
     cells = []
     for measure, _, scale in MEASURES:
         numbers = point.numbers(measure)
@@ -113,7 +116,3 @@ def _said(measure: str, value: float) -> str:
     return {"settling_time": f"{value:.2f} s", "overshoot": f"{100 * value:.1f} %", "error": f"{1e3 * value:.1f} mm"}[
         measure
     ]
-
-
-def _table(head: tuple[str, ...], rows: list[tuple[str, ...]]) -> str:
-    return "\n".join(f"| {' | '.join(line)} |" for line in (head, ("---",) * len(head), *rows))

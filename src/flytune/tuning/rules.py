@@ -13,6 +13,7 @@ from flytune.config import document, nested
 from flytune.config.document import Real
 from flytune.config.pytree import pytree
 from flytune.errors import BadInput
+from flytune.tables import Table
 
 # symptom -> the measure that misses its requirement, and the direction in which a rule has to move it
 SYMPTOMS = {
@@ -137,12 +138,10 @@ def apply_rule(rule: Rule, value: float, factor: float) -> float:
 
 def rules_table(rules: Sequence[Rule]) -> str:
     """The rules as a table for a terminal, and below it the advice that no edit of a single number expresses."""
-    rows = [("rule", "when", "edit", "factor at most", "range", "effect, if not measured", "not while", "reason")]
-    rows += [_row(rule) for rule in rules if not rule.advice]
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    lines = ["  ".join(text.ljust(width) for text, width in zip(row, widths, strict=True)).rstrip() for row in rows]
+    titles = ("rule", "when", "edit", "factor at most", "range", "effect, if not measured", "not while", "reason")
+    table = Table.plain(titles, [_row(rule) for rule in rules if not rule.advice], underlined=True)
     advice = [f"{rule.name}: {rule.advice} ({rule.source})" for rule in rules if rule.advice]
-    return "\n".join([lines[0], "-" * len(lines[0]), *lines[1:], *(["", "Advice:"] if advice else []), *advice])
+    return "\n".join([str(table), *(["", "Advice:"] if advice else []), *advice])
 
 
 def _row(rule: Rule) -> tuple[str, ...]:
