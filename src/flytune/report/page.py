@@ -25,7 +25,6 @@ from pathlib import Path
 from typing import Any
 
 import jinja2
-import plotly.graph_objects as go
 from markupsafe import Markup
 from plotly.offline import get_plotlyjs
 
@@ -78,13 +77,3 @@ def _plotly() -> str:
 def pack(text: str) -> str:
     """A text compressed, in letters that need no escaping in HTML; `page.js` unpacks it."""
     return base64.b64encode(gzip.compress(text.encode(), mtime=0)).decode()
-
-
-def page(title: str, body: str) -> str:
-    """A page of HTML that is already written; to be replaced by a template."""
-    return render("written.html", title=title, body=Markup(body))
-
-
-def drawing(plot: go.Figure | str, caption: str) -> str:
-    """A figure as HTML with its caption, which is HTML; to be replaced by `figure` of parts.html."""
-    return render("drawing.html", plot=plot, caption=Markup(caption))

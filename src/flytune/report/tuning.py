@@ -1,131 +1,198 @@
-"""The page of a tuning: what was asked, the response step by step, and the reason for each edit."""
+"""The page of a tuning: what was required and what was reached, the response of the result, and the reason of each edit."""
 
 import math
 from collections.abc import Mapping
-from html import escape
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import plotly.graph_objects as go
 from plotly.subplots import make_subplots
 
-from flytune.config.files import check_file, write_text
-from flytune.report import style
-from flytune.report.page import drawing, page
+from flytune.evaluation.evaluate import Evaluation, evaluate
+from flytune.evaluation.judge import Judgement
+from flytune.evaluation.statistics import quantile
+from flytune.report import plots, style
+from flytune.report.page import write_page
+from flytune.tables import NULL, Cell, Column, Table, number
 
 
-def write_tuning(path: Path, tuning: Mapping[str, Any]) -> None:
+def write_tuning(path: Path, tuning: Mapping[str, Any], evaluation: Evaluation | None = None) -> None:
     """Write the page of a tuning, whole or not at all.
 
     Args:
         path: the file.
-        tuning: `Tuning.to_dict`.
+        tuning: the plain values of a tuning, `Tuning.to_dict`.
+        evaluation: the best policy on its last validation set; it is flown again where None.
 
     Raises:
-        BadInput: the file cannot be written.
+        BadInput: the file cannot be written, or the best policy cannot be read.
     """
-    check_file(path)
-    write_text(path, page("flytune tune", _body(tuning)))
-
-
-def _body(tuning: Mapping[str, Any]) -> str:
-    outcome = (
-        f"Met: step {tuning['best']}, on starts the tuning never saw."
-        if tuning["met"]
-        else f"{tuning['why'][0].upper()}{tuning['why'][1:]}"
-    )
-    caption = (
-        "Each point is one policy, judged on the same starts; a line leads to it from the one that was edited. The "
-        "green band is what is asked, the filled point the policy that was kept. A step without a settling time has "
-        "too few trials that settle."
-    )
-    return (
-        f"<h1>{escape(tuning['title'])}</h1><p class='lead'>{escape(outcome)}</p>"
-        f"<h3>The response, step by step</h3>{drawing(response_per_step(tuning), caption)}"
-        f"<h3>Every edit and its reason</h3>{_steps(tuning)}"
-        f"<h3>Fresh starts</h3>{_verdicts(tuning)}"
+    evaluation = evaluation or evaluate_best(tuning)
+    outcome = f"Met by iteration {tuning['best']}, on a validation set that the tuning had not used before."
+    write_page(
+        path,
+        "tuning.html",
+        title=tuning["title"],
+        outcome=outcome if tuning["met"] else f"{tuning['why'][0].upper()}{tuning['why'][1:]}",
+        requirement=requirement_table(tuning, evaluation.judgement),
+        response=plots.response(evaluation.flights, evaluation.judgement, evaluation.task),
+        best=tuning["best"],
+        trials=evaluation.judgement.trials,
+        edits=edit_table(tuning),
+        iterations=response_per_iteration(tuning),
+        validations=validation_table(tuning),
     )
 
 
-def response_per_step(tuning: Mapping[str, Any]) -> go.Figure:
-    """Settling time, overshoot and error over the steps, each with the band that is asked for."""
-    asked, lines = tuning["requirement"], tuning["iterations"]
+def evaluate_best(tuning: Mapping[str, Any]) -> Evaluation:
+    """The best policy of a tuning, flown again on the last validation set that it was judged on."""
+    judged = _last_validation(tuning)["judgement"]
+    return evaluate(
+        tuning["directory"],
+        trials=judged["trials"],
+        seed=judged["seed"],
+        duration=judged["duration"],
+        initial_conditions=judged["starts"],
+    )
+
+
+def requirement_table(tuning: Mapping[str, Any], judgement: Judgement) -> Table:
+    """What was required, what the best policy reached on the validation set, and whether that is met."""
+    required, misses = tuning["requirement"], _last_validation(tuning)["misses"]
+    axis, percentile = required["axis"], required["percentile"]
+    scale, unit = _error_unit(axis)
+    times, level = judgement.settling_time[axis], "median" if percentile == 50 else f"percentile {percentile:g}"
+    time = "at most {0:g} s" if required["at_most"] else "{0:g} s ± {1:g} %"
+    overshoot = quantile(judgement.overshoot[axis], 0.5)
+    error = quantile(judgement.steady_state_error[axis], 0.5)
+    settled = np.count_nonzero(np.isfinite(times))
+    rows = {
+        "settling_time": (
+            f"settling time, {level}",
+            time.format(required["settling_time"], 100 * required["tolerance"]),
+            _with_unit(quantile(times, percentile / 100), 2, 1.0, "s"),
+        ),
+        "overshoot": (
+            "overshoot, median",
+            f"at most {100 * required['overshoot']:g} %",
+            _with_unit(overshoot, 1, 100.0, "%"),
+        ),
+        "error": (
+            "steady-state error, median",
+            f"at most {scale * required['error']:.3g} {unit}",
+            _with_unit(error, 2 if axis == "yaw" else 1, scale, unit),
+        ),
+        "settled": (
+            "trials that settle",
+            f"at least {100 * required['settled']:g} %",
+            f"{100 * settled / judgement.trials:g} % ({settled} of {judgement.trials})",
+        ),
+    }
+    if "constraints_satisfied" in misses:
+        share = 100 * (required["settled"] + misses["constraints_satisfied"])
+        rows["constraints_satisfied"] = (
+            "trials that satisfy your constraints",
+            f"at least {100 * required['settled']:g} %",
+            f"{share:.3g} %",
+        )
+    met, missed = Cell(text="met", tone="verdict good"), Cell(text="not met", tone="verdict bad")
+    return Table.plain(
+        (axis, "required", "reached", ""),
+        [(*row, missed if name in misses else met) for name, row in rows.items()],
+        style="narrow",
+    )
+
+
+def edit_table(tuning: Mapping[str, Any]) -> Table:
+    """Every edit, its reason and its result."""
+    rows = [
+        (
+            Cell(text=str(each["number"]), page=f"iteration\N{NO-BREAK SPACE}{each['number']}"),
+            "start" if each["parent"] is None else f"from {each['parent']}",
+            each["edit"],
+            each["result"],
+            f"{each['seconds']:.0f} s of training",
+        )
+        for each in tuning["iterations"]
+    ]
+    return Table.plain(("iteration", "parent", "edit and reason", "result", "duration"), rows, style="stacked")
+
+
+def validation_table(tuning: Mapping[str, Any]) -> Table:
+    """Every iteration that was judged on a validation set, and what misses the requirement there."""
+    axis = tuning["requirement"]["axis"]
+    scale, unit = _error_unit(axis)
+
+    def response(validation: Mapping[str, Any]) -> Mapping[str, Any]:
+        judged = validation["judgement"]
+        return judged["position"] if axis == "position" else judged["axes"][axis]
+
+    columns = (
+        Column("iteration", lambda each: each["iteration"]),
+        Column("seed", lambda each: each["seed"]),
+        Column("settling time [s]", lambda each: response(each)["settling_time"]["median"], decimals=2),
+        Column("settled", lambda each: f"{response(each)['settled']}/{each['judgement']['trials']}"),
+        Column("overshoot [%]", lambda each: response(each)["overshoot"]["median"], decimals=1, scale=100.0),
+        Column(f"error [{unit}]", lambda each: response(each)["steady_state_error"]["median"], decimals=2, scale=scale),
+        Column("not met", lambda each: ", ".join(each["misses"]).replace("_", " ") or "-", align="left"),
+    )
+    return Table.of(columns, tuning["validations"], style="dense")
+
+
+def response_per_iteration(tuning: Mapping[str, Any]) -> go.Figure:
+    """Settling time, overshoot and error over the iterations, each with the range that is required."""
+    required, lines = tuning["requirement"], tuning["iterations"]
     numbers = [line["number"] for line in lines]
-    degrees = asked["axis"] == "yaw"
-    scale, unit = (math.degrees(1), "deg") if degrees else (1e3, "mm")
-    wanted = asked["settling_time"]
-    spread = asked["tolerance"] * wanted
+    scale, unit = _error_unit(required["axis"])
+    wanted = required["settling_time"]
+    spread = required["tolerance"] * wanted
+    lowest, highest = (0.0, wanted) if required["at_most"] else (wanted - spread, wanted + spread)
     panels = (
-        ("settling time [s]", "settling_time", 1.0,
-         (0.0, wanted) if asked["at_most"] else (wanted - spread, wanted + spread)),
-        ("overshoot [%]", "overshoot", 100.0, (0.0, 100 * asked["overshoot"])),
-        (f"steady-state error [{unit}]", "error", scale, (0.0, scale * asked["error"])),
-    )  # fmt: skip
+        ("settling time [s]", "settling_time", 1.0, lowest, highest),
+        ("overshoot [%]", "overshoot", 100.0, 0.0, 100 * required["overshoot"]),
+        (f"steady-state error [{unit}]", "error", scale, 0.0, scale * required["error"]),
+    )
     figure = make_subplots(1, 3, subplot_titles=[style.heading(title) for title, *_ in panels], horizontal_spacing=0.08)
-    for column, (_, name, factor, (low, high)) in enumerate(panels, start=1):
+    fills = [style.TRIALS[0] if each == tuning["best"] else "white" for each in numbers]
+    marker = {"size": 9, "color": fills, "line": {"color": style.TRIALS[0], "width": 1.6}}
+    steps = [(line["parent"], line["number"]) for line in lines if line["parent"] is not None]
+    for column, (_, name, factor, low, high) in enumerate(panels, start=1):
         values = [None if line["response"][name] is None else factor * line["response"][name] for line in lines]
-        kept = [style.TRIALS[0] if number == tuning["best"] else "white" for number in numbers]
-        marker = {"size": 9, "color": kept, "line": {"color": style.TRIALS[0], "width": 1.6}}
         at = dict(zip(numbers, values, strict=True))
-        ways = [(line["parent"], line["number"]) for line in lines if line["parent"] is not None]
+        place: dict[str, Any] = {"row": 1, "col": column}
         figure.add_trace(
-            go.Scatter(x=[end for way in ways for end in (*way, None)],
-                       y=[end for first, second in ways for end in (at[first], at[second], None)],
-                       mode="lines", line={"color": style.TRIALS[0], "width": 1.2}, showlegend=False,
-                       hoverinfo="skip"),
-            row=1, col=column,
-        )  # fmt: skip
+            go.Scatter(
+                x=[end for step in steps for end in (*step, None)],
+                y=[end for first, second in steps for end in (at[first], at[second], None)],
+                mode="lines",
+                line={"color": style.TRIALS[0], "width": 1.2},
+                showlegend=False,
+                hoverinfo="skip",
+            ),
+            **place,
+        )
         figure.add_trace(
-            go.Scatter(x=numbers, y=values, mode="markers", marker=marker, showlegend=False,
-                       hovertemplate="%{y:.3g}"),
-            row=1, col=column,
-        )  # fmt: skip
-        # after the trace: plotly leaves an empty panel without it
-        figure.add_hrect(y0=low, y1=high, fillcolor=style.BAND, line_width=0, row=1, col=column)  # pyright: ignore
+            go.Scatter(x=numbers, y=values, mode="markers", marker=marker, showlegend=False, hovertemplate="%{y:.3g}"),
+            **place,
+        )
+        # after the traces: plotly leaves an empty panel without it
+        figure.add_hrect(y0=low, y1=high, fillcolor=style.BAND, line_width=0, **place)
         top = max([value for value in values if value is not None] + [high]) or 1.0
-        figure.update_yaxes(range=[0, 1.1 * top], row=1, col=column)
-    figure.update_xaxes(title_text="step", dtick=1 if len(numbers) < 15 else None)
+        figure.update_yaxes(range=[0, 1.1 * top], **place)
+    figure.update_xaxes(title_text="iteration", dtick=1 if len(numbers) < 15 else None)
     return style.frame(figure, 360, margin={"l": 50, "r": 14, "t": 64, "b": 48})
 
 
-def _steps(tuning: Mapping[str, Any]) -> str:
-    rows = "".join(
-        f"<tr><th>{line['number']}</th><td>{'' if line['parent'] is None else line['parent']}</td>"
-        f"<td>{escape(line['edit'])}</td><td>{escape(line['result'])}</td><td>{line['seconds']:.0f} s</td></tr>"
-        for line in tuning["iterations"]
-    )
-    head = "<tr><th>step</th><th>from</th><th>edit and reason</th><th>what it did</th><th>training</th></tr>"
-    return f'<div class="wide"><table class="words"><thead>{head}</thead><tbody>{rows}</tbody></table></div>'
+def _last_validation(tuning: Mapping[str, Any]) -> Mapping[str, Any]:
+    """The last validation of the best iteration."""
+    return next(each for each in reversed(tuning["validations"]) if each["iteration"] == tuning["best"])
 
 
-def _verdicts(tuning: Mapping[str, Any]) -> str:
-    rows = []
-    for verdict in tuning["validations"]:
-        judged = verdict["judgement"]
-        axis = tuning["requirement"]["axis"]
-        channel = judged["position"] if axis == "position" else judged["axes"][axis]
-        median = channel["settling_time"]["median"]
-        rows.append(
-            f"<tr><th>{verdict['iteration']}</th><td>{verdict['seed']}</td>"
-            f"<td>{'-' if median is None else f'{median:.2f} s'}</td>"
-            f"<td>{channel['settled']}/{judged['trials']}</td><td>{_percent(channel['overshoot']['median'])}</td>"
-            f"<td>{_error(channel['steady_state_error']['median'], axis)}</td>"
-            f"<td>{escape(', '.join(verdict['misses']).replace('_', ' ')) or 'nothing'}</td></tr>"
-        )
-    if not rows:
-        return '<p class="empty">No step came near enough to be judged on fresh starts.</p>'
-    head = (
-        "<tr><th>step</th><th>seed of the starts</th><th>settling time, median</th><th>settled</th>"
-        "<th>overshoot, median</th><th>error, median</th><th>missing</th></tr>"
-    )
-    return f'<div class="wide"><table><thead>{head}</thead><tbody>{"".join(rows)}</tbody></table></div>'
+def _error_unit(axis: str) -> tuple[float, str]:
+    """Factor and name of the unit that steady-state errors are shown in."""
+    return (math.degrees(1), "deg") if axis == "yaw" else (1e3, "mm")
 
 
-def _percent(value: float | None) -> str:
-    return "-" if value is None else f"{100 * value:.1f} %"
-
-
-def _error(value: float | None, axis: str) -> str:
-    if value is None:
-        return "-"
-    return f"{math.degrees(value):.2f} deg" if axis == "yaw" else f"{1e3 * value:.1f} mm"
+def _with_unit(value: float | None, decimals: int, scale: float, unit: str) -> str:
+    return NULL if value is None else f"{number(value, decimals, scale)} {unit}"
