@@ -39,6 +39,14 @@ def endless(tmp_path):
     return study
 
 
+@pytest.fixture
+def ctrl_c():
+    """Ctrl-C as Python answers it, also where the tests run in the background of a shell, which ignores it."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
 def pids(directory):
     """Processes whose command line names a directory."""
     listing = subprocess.run(["ps", "-axww", "-o", "pid=,command="], capture_output=True, text=True, check=True).stdout
@@ -63,7 +71,7 @@ def test_a_finished_study_is_not_trained_again(done):
 
 
 @pytest.mark.slow
-def test_a_worker_that_is_killed_is_started_again(endless):
+def test_a_worker_that_is_killed_is_started_again(endless, ctrl_c):
     victim = endless.trainings()[0].directory
     killed, lines, once = set(), [], threading.Event()
 
@@ -87,7 +95,7 @@ def test_a_worker_that_is_killed_is_started_again(endless):
 
 
 @pytest.mark.slow
-def test_ctrl_c_keeps_a_checkpoint_of_every_training_under_way(endless):
+def test_ctrl_c_keeps_a_checkpoint_of_every_training_under_way(endless, ctrl_c):
     under_way = set()
     lock = threading.Lock()
 
@@ -106,7 +114,7 @@ def test_ctrl_c_keeps_a_checkpoint_of_every_training_under_way(endless):
 
 
 @pytest.mark.slow
-def test_an_interrupted_study_goes_on_to_the_same_result(done, tmp_path):
+def test_an_interrupted_study_goes_on_to_the_same_result(done, tmp_path, ctrl_c):
     study = Study(folder=tmp_path / "study", seeds=1, steps=STEPS)
     open_study(study)
     first = study.trainings()[0]
