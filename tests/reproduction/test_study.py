@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+import flytune
 from flytune.errors import BadInput, Interrupted
 from flytune.reproduction.study import Study, open_study, training_status
 from flytune.reproduction.trainings import train_all
@@ -133,6 +134,19 @@ def test_an_interrupted_study_goes_on_to_the_same_result(done, tmp_path, ctrl_c)
     for ours, theirs in zip(study.trainings(), done.trainings(), strict=True):
         for name in ("policy.safetensors", "policy-last.safetensors"):
             assert (ours.directory / name).read_bytes() == (theirs.directory / name).read_bytes()
+
+
+@pytest.mark.slow
+def test_one_call_judges_a_finished_study_and_writes_every_file(done):
+    lines = []
+    result = flytune.reproduce(done.folder, seeds=1, steps=STEPS, on_message=lines.append)
+    assert lines[0] == "3 of 3 trainings were done before"
+    written = {str(path.relative_to(done.folder)) for path in result.files}
+    assert {"report.html", "verdicts.json", "verdicts.md", "figures/settling.svg"} <= written
+    assert all(path.stat().st_size for path in result.files)
+    told = json.loads((done.folder / "verdicts.json").read_text())
+    assert [claim["verdict"] for claim in told["verdicts"]] == [claim.verdict for claim in result.claims]
+    assert len(told["inconsistencies"]) == 10
 
 
 def copy_of(done, tmp_path):
