@@ -34,7 +34,7 @@ test-slow: .venv/dev.stamp
 # TORCH says what to install where torch is missing; set PIP_INDEX_URL or PIP_FIND_LINKS to take its smaller CPU build
 TORCH ?= torch==2.13.0
 test-sb3: .venv/sb3.stamp
-	$(PYTEST) tests/sb3
+	$(PYTEST) tests/sb3 tests/test_docs.py
 
 check: .venv/dev.stamp
 	$(BIN)/ruff check .

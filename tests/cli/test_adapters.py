@@ -82,7 +82,7 @@ def test_compare_prints_tables_and_writes_a_page_and_its_numbers(folder):
         ("mujoco", ["evaluate", "pid", "--world", "mujoco"]),
         ("onnx", ["export", "run", "--format", "onnx", "--out", "new.onnx"]),
         ("tensorboard", ["train", "baseline", "--tensorboard", "--out", "new"]),
-        ("stable_baselines3", ["train", "baseline", "--trainer", "sb3", "--out", "new"]),
+        ("gymnasium", ["train", "baseline", "--trainer", "sb3", "--out", "new"]),
     ],
 )
 def test_a_missing_package_is_named_with_its_remedy_and_nothing_is_written(
@@ -91,7 +91,7 @@ def test_a_missing_package_is_named_with_its_remedy_and_nothing_is_written(
     monkeypatch.chdir(folder)
     monkeypatch.setitem(sys.modules, package, None)  # an import of it now fails as if it were not installed
     before = sorted(os.listdir(folder))
-    extra = {"stable_baselines3": "sb3"}.get(package, package)
+    extra = {"gymnasium": "sb3"}.get(package, package)
     assert f'{package}: is not installed. Install it with: pip install "flytune[{extra}]"' in refused(
         *arguments, capsys=capsys
     )

@@ -15,7 +15,7 @@ OPTIONS = {
     "compare": "CONTROLLER --task --world --world-set --trials --seed --duration --starts --json --out --flights",
     "report": "CONTROLLER --task --world --world-set --trials --seed --duration --starts --out",
     "tune": "TASK --settling-time --at-most --tolerance --overshoot --error --axis --percentile --set --rules --trainer "
-    "--steps --seed --out --resume",
+    "--iterations --seed --out --resume",
     "rules": "--rules --json",
     "reproduce": "--trainer --seeds --steps --refined --out --json",
     "export": "CONTROLLER --format --out",
@@ -107,9 +107,14 @@ def test_every_option_arrives_with_its_type():
 def test_a_bare_tuning_asks_for_what_the_help_says():
     *_, options = parsed("tune", "--settling-time", "2.5")
     assert (options.settling_time, options.tolerance, options.overshoot, options.error) == (2.5, 10.0, 5.0, None)
-    assert (options.axis, options.percentile, options.trainer, options.steps, options.seed) == (
+    assert (options.axis, options.percentile, options.trainer, options.iterations, options.seed) == (
         "position", 50.0, "apg", 12, 0,
     )  # fmt: skip
+
+
+def test_the_iterations_of_a_tuning_may_be_called_steps():
+    *_, options = parsed("tune", "--settling-time", "2.5", "--steps", "3")
+    assert options.iterations == 3
 
 
 REFUSED = {

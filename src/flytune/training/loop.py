@@ -76,9 +76,9 @@ def train(
     method = find_trainer(trainer)
     if not 0 <= seed < 2**32:
         raise BadInput(f"seed: {seed} is not allowed. Allowed: a whole number, 0 to {2**32 - 1}.")
-    method.check(task)
     if warm_start is not None:
         method.check_warm_start(task, warm_start)
+    method.check(task)
     if tensorboard:
         check_tensorboard()
         if out is None:
