@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import flytune
 from flytune.control.controller import Controller
 from flytune.control.policy import ACTION, Network, Policy, make_network
 from flytune.errors import BadInput
@@ -112,6 +113,26 @@ def test_a_failed_export_keeps_the_file_that_was_there(policy, exported):
 def test_a_path_that_cannot_be_written_is_named(policy, tmp_path):
     with pytest.raises(BadInput, match=r"out: .*nowhere.* cannot be written"):
         save_onnx(tmp_path / "nowhere" / "policy.onnx", policy)
+
+
+def test_one_call_exports_what_was_trained_or_found_in_any_format(policy, exported, tmp_path):
+    written = flytune.export_policy(policy, tmp_path / "again.onnx")
+    assert written.read_bytes() == exported.read_bytes()
+    written = flytune.export_policy(
+        flytune.find_controller("baseline-refined"), tmp_path / "p.safetensors", "safetensors"
+    )
+    shipped = flytune.find_controller("baseline-refined").controller
+    np.testing.assert_array_equal(flytune.load_policy(written).actor.weights[0], shipped.actor.weights[0])
+
+
+def test_a_controller_without_weights_and_an_unknown_format_are_refused_before_anything_is_written(exported, tmp_path):
+    with pytest.raises(BadInput, match=r"^pid: cannot be exported. Allowed: a policy with its weights"):
+        flytune.export_policy(flytune.find_controller("pid"), tmp_path / "p.onnx")
+    with pytest.raises(BadInput, match=r"^OnnxController: cannot be exported"):
+        flytune.export_policy(load_onnx(exported), tmp_path / "p.onnx")
+    with pytest.raises(BadInput, match=r"^format: 'keras' is unknown. Allowed: onnx, safetensors."):
+        flytune.export_policy(load_onnx(exported), tmp_path / "p.onnx", "keras")
+    assert not (tmp_path / "p.onnx").exists()
 
 
 def test_the_same_policy_gives_the_same_bytes(policy, exported, tmp_path):

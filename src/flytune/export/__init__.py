@@ -28,9 +28,10 @@ def export_policy(policy: Any, path: str | Path, format: Format = "onnx") -> Pat
         raise BadInput(f"format: {format!r} is unknown. Allowed: {', '.join(get_args(Format))}.")
     learned = getattr(policy, "controller", policy)
     if not isinstance(learned, Policy):
+        name = getattr(policy, "name", type(learned).__name__)
         raise BadInput(
-            f"policy: a {type(learned).__name__} cannot be exported. Allowed: a policy with its weights, from a "
-            "training, a run directory, a .safetensors file, a .zip of Stable-Baselines3, or one that ships."
+            f"{name}: cannot be exported. Allowed: a policy with its weights, from a training, a run directory, "
+            "a .safetensors file, a .zip of Stable-Baselines3, or one that ships."
         )
     writers[format](Path(path), learned)
     return Path(path)
