@@ -41,8 +41,7 @@ def check_types(function):
 
 sys.modules["flytune_type_checker"] = checker = ModuleType("flytune_type_checker")
 checker.check_types = check_types
-CHECKED = "config, control, errors, evaluation.judge, evaluation.metrics, export, extras, physics, runs, simulation.environment, task"
-install_import_hook([f"flytune.{room}" for room in CHECKED.split(", ")], "flytune_type_checker.check_types")
+install_import_hook("flytune", "flytune_type_checker.check_types")
 
 
 @pytest.fixture(autouse=True, scope="module")

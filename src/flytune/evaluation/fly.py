@@ -246,7 +246,7 @@ def _margins(task: Task, states: jax.Array, actions: jax.Array) -> dict[str, jax
     return jax.vmap(one, in_axes=-1)(states, actions)
 
 
-def _not_finite(name: str, action: Any, trial: int, step: int) -> Diverged:
+def _not_finite(name: str, action: Any, trial: int | np.integer, step: int | np.integer) -> Diverged:
     """The error of a controller whose action is not finite."""
     return Diverged(
         f"{name or 'controller'}: action {action} is not finite in trial {trial} "

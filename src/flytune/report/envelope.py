@@ -52,7 +52,7 @@ def _tightness(margin: Float[np.ndarray, "N K"]) -> float:
 
 def _draw_margin(
     figure: go.Figure, flights: Flights, margin: Float[np.ndarray, "N K"], row: int, column: int, legend: bool
-) -> list[Float[np.ndarray, "K"]]:
+) -> list[Float[np.ndarray, "drawn"]]:
     """Draw a panel; what comes back are its curves, from the smallest to the largest margin."""
     step = 2 * stride(flights)
     levels = _percentiles(100.0 * np.minimum(margin[:, ::step], 1.0), (0, 5, 50, 95, 100))  # altitudes may have more

@@ -2,7 +2,7 @@
 
 import dataclasses
 import math
-from typing import Annotated, Any, Protocol
+from typing import Annotated, Any, Protocol, runtime_checkable
 
 from annotated_types import Ge, Gt, Le, Lt, Unit
 
@@ -15,6 +15,7 @@ Positive = Annotated[Real, Gt(0), Unit("1")]
 Count = Annotated[Whole, Ge(1), Le(1_000_000)]
 
 
+@runtime_checkable
 class TrainerSettings(Protocol):
     """The part of the settings that is the same for every trainer."""
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 import dataclasses
 import json
 from importlib import import_module
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
 from flytune.errors import BadInput
 from flytune.extras import require
@@ -33,6 +33,7 @@ __all__ = [
 ]
 
 
+@runtime_checkable
 class Algorithm(Protocol):
     """The functions of a trainer's module. They are pure; `TrainState` is a JAX pytree of the module's own."""
 
