@@ -1,4 +1,4 @@
-"""How exact and how dear the physics step is: the tables of docs/concepts/integrator.md, as markdown on standard output.
+"""Accuracy and cost of the physics step: prints the tables of docs/concepts/integrator.md as Markdown.
 
     python benchmarks/integrator.py
 

@@ -4,7 +4,7 @@
     flytune reproduce --refined --trainer ppo --out refined-ppo
     python benchmarks/ship_policies.py refined-apg refined-ppo
 
-The best seed is the one with the most feasible trials settled on all axes; among equals, the one with the smallest median
+The best seed has the most feasible trials settled on all axes; among equals, the smallest median
 position error. The script flies the averaged policy, on trials that neither training nor `evaluate` uses.
 """
 

@@ -1,4 +1,4 @@
-"""How other simulators differ from flytune's, and why: the tables of docs/results/worlds.md, as markdown on standard output.
+"""How other simulators differ from flytune's, and why: prints the tables of docs/results/worlds.md as Markdown.
 
     python benchmarks/worlds.py [POLICY.safetensors]
 
@@ -183,7 +183,7 @@ def compare_causes(vehicle: Vehicle, actions: np.ndarray) -> None:
 
 @pytree
 class RateInInertialFrame:
-    """A controller who is shown the angular velocity in the inertial frame where it expects the body rate (target yaw 0)."""
+    """A controller that gets the angular velocity in the inertial frame instead of the body rate (target yaw 0)."""
 
     controller: Any
 

@@ -35,7 +35,7 @@ class Switched:
         return self.far.initial_memory(), self.near.initial_memory()
 
     def act(self, memory, observation):
-        """The action of one observation: position error (3), attitude error (4), velocity (3), body rate (3), action (4)."""
+        """The action of one observation: position error 3, attitude error 4, velocity 3, body rate 3, last action 4."""
         far_memory, far_action = self.far.act(memory[0], observation)
         near_memory, near_action = self.near.act(memory[1], observation)
         is_near = jnp.linalg.norm(observation[:3]) < self.distance

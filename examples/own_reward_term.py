@@ -1,7 +1,8 @@
 """Add a reward term of your own to a task, and train with it: here a penalty on climbing and sinking.
 
 A term is a JAX pytree that can be called with a situation (position error, velocity, ... of one vehicle) and returns
-the reward of one step. To use it in task files too, add it to the package: see "To add a reward term" in CONTRIBUTING.md.
+the reward of one step. To use it in task files too, add it to the package: see "To add a reward term" in
+CONTRIBUTING.md.
 
 python examples/own_reward_term.py               about a minute
 python examples/own_reward_term.py --updates 3   a few seconds; the policy then flies badly

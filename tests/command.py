@@ -50,7 +50,7 @@ def interrupted(*arguments, cwd, at):
 
 
 def refused(*arguments, capsys):
-    """The one line that a command in this process writes to standard error when it ends with 2, having printed nothing."""
+    """The one line that a command writes to standard error when it ends with 2 and has printed nothing."""
     capsys.readouterr()
     assert main(list(map(str, arguments))) == 2
     said = capsys.readouterr()

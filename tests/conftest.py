@@ -21,7 +21,7 @@ from beartype import BeartypeConf, FrozenDict, beartype
 from jaxtyping import install_import_hook
 from tests.chromium import BROWSERS, ON_A_MAC, Browser
 
-# A float may be an int, and in compiled code it is a tracer. Beartype knows no Self outside of a class that it decorates.
+# A float may be an int, and in compiled code it is a tracer. Beartype knows no Self outside of a decorated class.
 RULES = BeartypeConf(hint_overrides=FrozenDict({float: float | int | jax.Array, Self: object}))
 
 

@@ -1,4 +1,4 @@
-"""The reference of the task file: every key with unit, allowed values, default and meaning, read from the dataclasses."""
+"""The reference of the task file: unit, allowed values, default and meaning of every key, from the dataclasses."""
 
 import ast
 import dataclasses
@@ -90,7 +90,8 @@ def rows(kind: type) -> Iterator[str]:
             values = f"`{get_args(base)[0]}`" if get_origin(base) is Literal else ""
             yield f"| `kind` | | {values} | required | names the class |"
             continue
-        yield f"| `{field.name}` | {cell(unit(annotation))} | {cell(allowed(annotation))} | {default(field)} | {cell(notes[field.name])} |"
+        cells = (cell(unit(annotation)), cell(allowed(annotation)), default(field), cell(notes[field.name]))
+        yield f"| `{field.name}` | {' | '.join(cells)} |"
 
 
 def tables(kind: type, path: str, level: int) -> Iterator[str]:

@@ -1,6 +1,6 @@
 """One model of a table, written as text for a terminal, as HTML for a page and as Markdown.
 
-A table is columns and rows. Simple ones are built from titles and texts, where each column is as wide as its longest text:
+A table is columns and rows. A simple one is built from titles and texts; each column is as wide as its longest text:
 
     Table.plain(("rule", "when"), [("H1", "too slow"), ("H2", "overshoots")])
 
@@ -23,7 +23,7 @@ NULL = "-"  # stands for a number that does not exist or is infinite
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Cell:
-    """A cell that says more than its text: on a page it may be longer, have a colour, or a number in a colour of its own."""
+    """A cell with more than a text: on a page it may have another text, a colour, or a coloured number."""
 
     text: str  # a line break in it starts a new line on a page
     page: str = ""  # what a page writes instead, where the terminal's text is shortened
@@ -41,8 +41,8 @@ class Column:
     Args:
         title: the heading; with a `group` the second line of it.
         value: the cell of a record; columns of `Table.plain` have none.
-        group: heading above all neighbouring columns that have the same one. Spaces at its ends, or at those of a title,
-            shift it in a terminal only.
+        group: heading above all neighbouring columns that have the same one. Spaces at its ends, or at the ends of a
+            title, shift it in a terminal only.
         align: "right" for numbers, "left" for words, which may break into lines on a page.
         decimals: of the numbers in it; None for whole numbers and texts.
         scale: factor of the numbers, from SI to the unit that the heading names.

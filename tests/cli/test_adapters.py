@@ -1,4 +1,4 @@
-"""The commands that lead elsewhere, as a user meets them: other simulators, other controllers, other files, missing packages."""
+"""Commands with other simulators, other controllers, other files and missing packages, as a user types them."""
 
 import json
 import os

@@ -1,4 +1,4 @@
-"""What is typed on the command line: which commands and options exist, how they are explained, and how they are refused."""
+"""The command line: which commands and options exist, how they are explained, and how they are refused."""
 
 import subprocess
 import sys
@@ -14,7 +14,8 @@ OPTIONS = {
     "evaluate": "CONTROLLER --task --world --world-set --trials --seed --duration --starts --json --out --flights",
     "compare": "CONTROLLER --task --world --world-set --trials --seed --duration --starts --json --out --flights",
     "report": "CONTROLLER --task --world --world-set --trials --seed --duration --starts --out",
-    "tune": "TASK --settling-time --at-most --tolerance --overshoot --error --axis --percentile --set --rules --trainer "
+    "tune": "TASK --settling-time --at-most --tolerance --overshoot --error --axis --percentile --set --rules "
+    "--trainer "
     "--iterations --seed --out --resume",
     "rules": "--rules --json",
     "reproduce": "--trainer --seeds --steps --refined --out --json",

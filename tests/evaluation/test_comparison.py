@@ -318,7 +318,8 @@ def test_the_table_has_a_row_per_controller_under_the_conditions_they_share(make
     table = compare([make_judgement("apg"), make_judgement(long, crashed=lost, violated={"speed": ~lost})]).table()
     lines = table.splitlines()
     assert lines[0] == (
-        "2 controllers over the same 5 trials of 10 s, starts clear, seed 1; world flytune; task baseline; vehicle crazyflie"
+        "2 controllers over the same 5 trials of 10 s, starts clear, seed 1; world flytune; task baseline; "
+        "vehicle crazyflie"
     )
     assert lines[4].split() == [
         "apg",

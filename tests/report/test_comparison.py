@@ -31,7 +31,7 @@ def make_flown(make_evaluation, flights):
 
 @pytest.fixture(scope="session")
 def six(make_flown, flights, task):
-    """Six controllers: slow and fast ones, one that settles nothing, one that crashes at once, long and hostile names."""
+    """Six controllers: slow and fast ones, one that never settles, one that crashes at once, long and hostile names."""
     everything = np.ones(flights.trials, dtype=bool)
     return [
         make_flown("fast", 4.0),

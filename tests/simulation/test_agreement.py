@@ -217,7 +217,7 @@ def test_a_simulator_comes_to_flytunes_physics_as_its_step_shrinks(name, vehicle
     own = fly("flytune", vehicle, start, actions)
     coarse, fine = (difference(fly(name, vehicle, start, actions, physics_steps=steps), own) for steps in (10, 20))
     if name == "mujoco":
-        # float32 rounds by 2e-5 (docs/concepts/integrator.md), which hides what is left of RK4, and of a lag held for 1 ms
+        # float32 rounds by 2e-5 (docs/concepts/integrator.md), which hides the errors of RK4 and of a lag held for 1 ms
         assert max(coarse.max(), fine.max()) < 5e-5
     else:
         # semi-implicit Euler is of first order; second-order remainders are h over the time scale of the motion

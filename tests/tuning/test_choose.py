@@ -244,7 +244,7 @@ def test_an_edit_that_makes_another_measure_miss_is_refused():
 
 
 def test_the_nearest_iteration_predicts_the_other_measures_of_an_edit():
-    # the edit lies nearer to the faster iteration; where trials do not settle there, a longer training is predicted better
+    # the edit is nearer to the faster iteration; where trials do not settle, a longer training is predicted better
     wanted = make_requirement(2, tolerance=2)
     rules = [rule for rule in RULES if rule.field in (SPEED, "apg.updates")]
     iterations = after([iteration(settling_time=2.2)], wanted, settling_time=1.985)

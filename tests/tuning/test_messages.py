@@ -28,8 +28,8 @@ EDIT = Edit(
 def test_an_edit_names_its_symptom_its_size_its_prediction_and_its_reason():
     assert describe_edit(EDIT, WANTED) == (
         "too slow: termination.speed.bound 0.2 -> 0.304 m/s, expected settling time 5.99 s (settling time ~ "
-        "bound^-1.4, sensitivity measured from 0.3 to 0.5, extrapolated). H7 faster: a higher speed bound lets the vehicle fly faster. "
-        "Next best: reward.velocity.weight 0.1 -> 0.05, expected settling time 10.31 s (H6 faster)"
+        "bound^-1.4, sensitivity measured from 0.3 to 0.5, extrapolated). H7 faster: a higher speed bound lets the "
+        "vehicle fly faster. Next best: reward.velocity.weight 0.1 -> 0.05, expected settling time 10.31 s (H6 faster)"
     )
 
 
@@ -60,8 +60,8 @@ def test_an_edit_names_the_origin_of_its_size(changes, said):
 
 def test_the_requirement_on_the_training_set_is_told_in_numbers():
     assert describe_target(WANTED.tightened(), 100, 15.0) == (
-        "100 trials of 15 s; required there: 5.70 to 6.30 s, overshoot at most 4.0 %, error at most 8.00 mm. A trial has "
-        "settled if it stays within 2 cm until its end; a trial that has not counts as infinitely slow"
+        "100 trials of 15 s; required there: 5.70 to 6.30 s, overshoot at most 4.0 %, error at most 8.00 mm. A trial "
+        "has settled if it stays within 2 cm until its end; a trial that has not counts as infinitely slow"
     )
     assert "required there: at most 2.00 s, " in describe_target(
         make_requirement(2.0, at_most=True, axis="yaw"), 100, 10.0

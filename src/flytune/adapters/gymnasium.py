@@ -53,12 +53,12 @@ class HoverEnv(gymnasium.Env[np.ndarray, np.ndarray]):
     Args:
         task: a preset, a .toml file, or a Task.
         edits: field path -> value, applied to a preset or file.
-        world: whose physics: "flytune", "pybullet" or "mujoco".
-        world_options: of that world, see `worlds.make_world`.
+        simulator: "flytune", "pybullet" or "mujoco".
+        simulator_options: of that simulator, see `make_simulator`.
         render_mode: None, or "rgb_array".
 
     Raises:
-        BadInput: one of these is not allowed, or the world's package is not installed.
+        BadInput: one of these is not allowed, or the simulator's package is not installed.
     """
 
     metadata = METADATA

@@ -44,7 +44,7 @@ class Measurement:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Case:
-    """One case of a benchmark: fields as of `Measurement`, the extras that it needs, and the function that prepares it."""
+    """One case of a benchmark: fields as in `Measurement`, the extras it needs, and the function that prepares it."""
 
     what: str
     environments: int
@@ -71,7 +71,7 @@ def measurements_table(measurements: Sequence[Measurement]) -> Table:
 
 
 def compare_training(task: Task, own: Repeat) -> list[Measurement]:
-    """Training by Stable-Baselines3 on PyBullet and on flytune's environments, and by flytune's PPO (`own`: one update)."""
+    """Training by Stable-Baselines3 on PyBullet and on flytune, and by flytune's PPO (`own`: one update)."""
     number, rollout = task.ppo.environments, task.ppo.rollout
     elsewhere, here = partial(_pybullet_processes, task), partial(_own_environments, task)
 
@@ -178,7 +178,7 @@ def fastest(runs: Sequence[Repeat], clock: Callable[[], float] = time.perf_count
 
 
 def make_environment(task: Task) -> Any:
-    """The environment of the baseline: flytune's for Gymnasium with PyBullet's physics, in Stable-Baselines3's monitor."""
+    """The environment of the baseline: flytune's for Gymnasium, in PyBullet, in Stable-Baselines3's monitor."""
     from stable_baselines3.common.monitor import Monitor
 
     from flytune.adapters.gymnasium import HoverEnv

@@ -1,4 +1,4 @@
-"""What a classical controller reads out of the observation: the 17 numbers, with the attitude turned back to the world."""
+"""The observation as a classical controller uses it: the 17 numbers, with the attitude in the inertial frame."""
 
 from typing import Any
 

@@ -18,7 +18,7 @@ SHARED = {  # what has to be the same: the option that sets it, and its unit
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
 class Comparison:
-    """Several controllers over the same trials, each under a name of its own, and how each differs from the reference."""
+    """Several controllers over the same trials, under different names, and how each differs from the reference."""
 
     judgements: tuple[Judgement, ...]
     reference: int  # which of them the others are compared with
@@ -51,9 +51,9 @@ class Comparison:
 def compare(judgements: Sequence[Judgement], *, reference: int = 0) -> Comparison:
     """The comparison of two or more controllers over the same trials.
 
-    Start and noise of a trial depend on seed and trial alone, so that trial i of one controller is paired with trial i of
-    the reference: the luck of the draw, which is most of the spread between trials, drops out of their difference.
-    World, task and vehicle may differ; that is then what is compared.
+    Initial state and noise of a trial depend on seed and trial alone. So trial i of one controller is paired with
+    trial i of the reference, and their difference does not contain the spread of the initial states. Simulator, task
+    and vehicle may differ.
 
     Args:
         judgements: of the controllers, in the order of the table; names that occur twice are made different.

@@ -16,8 +16,10 @@ MAY_DIFFER = ("simulator", "task", "vehicle")  # between controllers whose trial
 LONGEST = 30  # characters of a name in the table
 
 NOTE = (
-    "Differences are medians over the trials, each with itself: infinite where one controller settles, or flies on, and the",
-    "other does not. Intervals are for these controllers as they are; another training of the same kind would differ more.",
+    "Differences are medians over the trials, each with itself: infinite where one controller settles, or flies on, "
+    "and the",
+    "other does not. Intervals are for these controllers as they are; another training of the same kind would differ "
+    "more.",
 )
 
 WAYS = {  # field of the judgement -> (how a controller with more of it compares, how one with less)
@@ -87,7 +89,8 @@ COLUMNS = (  # spaces at the ends of a heading place it in a terminal
     *(_settled(channel, channel[:3]) for channel in CHANNELS),
     Column("median", lambda row: row.judged["position"]["settling_time"]["median"], group="settling [s]", decimals=2,
            width=9),
-    Column("p95", lambda row: row.judged["position"]["settling_time"]["p95"], group="settling [s]", decimals=2, width=8),
+    Column("p95", lambda row: row.judged["position"]["settling_time"]["p95"], group="settling [s]", decimals=2,
+           width=8),
     Column("[%]", lambda row: row.judged["position"]["overshoot"]["median"], group="overshoot", decimals=1, scale=100.0,
            width=13),
     Column("[mm]", lambda row: row.judged["position"]["steady_state_error"]["median"], group="final error", decimals=1,
@@ -118,7 +121,7 @@ def comparison_text(judgements: Sequence[Judgement], reference: int, differences
 
 
 def differences_table(judgements: Sequence[Judgement], reference: int, differences: Sequence[Difference]) -> Table:
-    """One row per metric, one column per controller but the reference: the median difference, its interval, the trials."""
+    """Per metric and controller but the reference: the median difference, its interval, and the trials."""
     names = [judgement.name for judgement in judgements]
     others = [Column(f"{n} {name}", align="left") for n, name in enumerate(names, start=1) if n != reference + 1]
     rows = []
@@ -156,7 +159,8 @@ def conditions(judgements: Sequence[Judgement]) -> str:
     first = judgements[0]
     trials = "the same trial" if first.trials == 1 else f"the same {first.trials} trials"
     text = [
-        f"{len(judgements)} controllers over {trials} of {first.duration:g} s, starts {first.initial_conditions}, seed {first.seed}"
+        f"{len(judgements)} controllers over {trials} of {first.duration:g} s, starts {first.initial_conditions}, "
+        f"seed {first.seed}"
     ]
     for field in MAY_DIFFER:
         flown = {judgement.name: str(getattr(judgement, field)) for judgement in judgements}
@@ -169,7 +173,7 @@ def conditions(judgements: Sequence[Judgement]) -> str:
 
 
 def sentences(differences: Sequence[Difference], against: str) -> list[str]:
-    """How a controller differs from the one called `against`, a clause for each metric that has words; the first is whole.
+    """How a controller differs from the one called `against`, a clause for each metric in `WORDS`; the first is whole.
 
     The clauses after the first leave out both names.
     """

@@ -86,7 +86,7 @@ class Difference:
 
 
 def paired_difference(controller: PerTrial, reference: PerTrial) -> PerTrial:
-    """Controller less reference, trial by trial: +inf where the controller alone failed, -inf where the reference alone did.
+    """Controller less reference, trial by trial: +inf where only the controller failed, -inf where only the other did.
 
     0 where both failed, which is a tie and no knowledge of who failed worse. NaN where the metric does not apply to
     either, or applies to one of two that did not fail.
@@ -98,7 +98,7 @@ def paired_difference(controller: PerTrial, reference: PerTrial) -> PerTrial:
 
 
 def compare_metric(controller: Judgement, reference: Judgement, metric: Metric) -> Difference:
-    """How a controller differs from the reference by one metric, with the median's 95 % bootstrap interval over trials."""
+    """How a controller differs from the reference in one metric, with the 95 % bootstrap interval of the median."""
     paired = paired_difference(metric.values(controller), metric.values(reference))
     applies = ~np.isnan(paired)
     middle, low, high = median_and_interval(paired[applies])

@@ -1,4 +1,4 @@
-"""The response table: one row per channel, the same in a terminal, on a page and in Markdown; and the judgement in a line.
+"""The response table, one row per channel, for a terminal, a page and Markdown; and the judgement in one line.
 
 Everything is written from what `Judgement.to_dict` gives, '-' where a quantile is infinite.
 """
@@ -33,7 +33,8 @@ class _Channel:
 COLUMNS = (
     Column("", lambda row: row.name, align="left", width=10),
     Column("", lambda row: f"{row.judged['settled']}/{row.trials}", group="settled", width=9),
-    Column("median", lambda row: row.judged["settling_time"]["median"], group="settling time [s]", decimals=2, width=11),
+    Column("median", lambda row: row.judged["settling_time"]["median"], group="settling time [s]", decimals=2,
+           width=11),
     Column("p95", lambda row: row.judged["settling_time"]["p95"], group="settling time [s]", decimals=2, width=9),
     Column("median", lambda row: row.judged["rise_time"]["median"] if "rise_time" in row.judged else "",
            group="rise [s]", decimals=2, width=11),

@@ -31,7 +31,7 @@ TANH_ERROR = 8 * UNIT_ROUNDOFF  # measured: 5.5 in onnxruntime 1.32, 4.6 in XLA,
 
 
 def save_onnx(path: Path, policy: Policy) -> None:
-    """Write a policy as ONNX, after a check that onnxruntime computes its actions; the same policy gives the same bytes.
+    """Write a policy as ONNX, after a check that onnxruntime computes its actions; bytes depend on the policy alone.
 
     Raises:
         BadInput: the extra `onnx` is missing, the file cannot be written, or onnxruntime computes other actions. An

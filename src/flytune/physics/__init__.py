@@ -1,1 +1,1 @@
-"""What the world does: rotations, vehicles and the equations of motion, for one vehicle at a time."""
+"""Physics: rotations, vehicles and the equations of motion, for one vehicle at a time."""

@@ -2,7 +2,7 @@
 
 XLA turns arithmetic on scalars (one lane per vehicle under `vmap`) into vectorised loops, but a gradient through
 slices and stacks of length-3 arrays into chains of pads and copies, up to twice as slow (docs/concepts/integrator.md).
-`unpack` and `pack` are the two doors between arrays and scalars, each the other's transpose.
+`unpack` and `pack` convert between arrays and scalars; each is the transpose of the other.
 """
 
 from typing import Any

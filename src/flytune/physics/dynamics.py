@@ -12,12 +12,14 @@ from flytune.physics.rotors import thrust_and_torque
 from flytune.physics.vehicle import Vehicle
 
 CONTROL_PERIOD = 0.01  # s (paper R6)
-PHYSICS_STEPS = 1  # per control period, forces and attitude also at its middle; docs/concepts/integrator.md shows that finer buys nothing
+# per control period; forces and attitude are also evaluated at its middle. More steps are not more accurate in float32
+# (docs/concepts/integrator.md).
+PHYSICS_STEPS = 1
 
 
 @pytree
 class State:
-    """Everything that moves, of one vehicle; vectors as tuples of scalars, see `components`."""
+    """The state of one vehicle; vectors as tuples of scalars, see `components`."""
 
     position: Components  # 3, m, inertial frame, z up
     attitude: Components  # 4, unit quaternion (x, y, z, w), body to inertial
@@ -82,7 +84,7 @@ def rotor_speed_after(vehicle: Vehicle, now: Components, commanded: Components, 
 def step(vehicle: Vehicle, state: State, action: Float[Array, "4"], physics_steps: int = PHYSICS_STEPS) -> State:
     """The state one control period (0.01 s) later, under one action in [-1, 1]^4.
 
-    The action waits out the latency, moves the motors, and the motors move the body.
+    The motors receive the action after the latency.
     """
     queue = jnp.concatenate([state.pending_actions, action[None]])
     commanded = tuple(commanded_rotor_speed(vehicle, motor) for motor in unpack(queue[0]))

@@ -43,7 +43,7 @@ def exponential(rotation: Components) -> Components:
 
 
 def vertical_axis(quaternion: Components) -> Components:
-    """The body's z axis seen in the inertial frame, R(q) [0, 0, 1]: where thrust points."""
+    """The body's z axis in the inertial frame, R(q) [0, 0, 1]: the direction of the thrust."""
     x, y, z, w = quaternion
     return 2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)
 

@@ -1,4 +1,4 @@
-"""The four rotors: where they stand, which way they spin, and the thrust and torque they give.
+"""The four rotors: their places, their spins, and their thrust and torque.
 
 Everything that depends on the layout of the rotors takes it from here: the equations of motion, the allocation of
 thrust and torque to rotors, the simulators' files, the ground effect and the picture.

@@ -33,7 +33,7 @@ BOXES = (
 
 
 def responses(flights: Sequence[Flights], comparison: Comparison) -> go.Figure:
-    """x, y, z, yaw and distance: the same few trials of every controller, and the error of all trials as it dies out."""
+    """x, y, z, yaw and distance of the same few trials of every controller, and the errors of all trials over time."""
     figure = make_subplots(
         len(CHANNELS),
         2,

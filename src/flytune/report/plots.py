@@ -51,7 +51,7 @@ def response(flights: Flights, judgement: Judgement, task: Task) -> go.Figure:
 
 
 def motion(flights: Flights, judgement: Judgement) -> go.Figure:
-    """Roll, pitch and body rates of the first trials against time, beside the commands of their motors and their speed."""
+    """Roll, pitch, body rates, motor commands and speed of the first trials against time."""
     roll, pitch = _tilt(flights.attitude)
     rates, action = np.degrees(flights.body_rate), flights.action
     left = [("roll [deg]", roll), ("pitch [deg]", pitch)]

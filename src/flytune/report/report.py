@@ -35,8 +35,8 @@ def write_report(path: Path, evaluations: Sequence[Evaluation], comparison: Comp
     Args:
         path: the file; one that is there is replaced.
         evaluations: the controllers, 1 or more, in the order of the page.
-        comparison: of their judgements, in the same order. Without it, controllers that flew the same trials are compared
-            with the first one; for others, the page says why there are no paired differences.
+        comparison: of their judgements, in the same order. Where None, controllers that flew the same trials are
+            compared with the first one; for others, the page says why there are no paired differences.
 
     Raises:
         BadInput: no controller, a comparison of other controllers or other trials, or the file cannot be written.
@@ -102,7 +102,7 @@ def _controller(name: str, evaluation: Evaluation) -> dict[str, Any]:
 
 
 def _comparison(names: Sequence[str], evaluations: Sequence[Evaluation], compared: Comparison | str) -> dict[str, Any]:
-    """What the page shows of several controllers together; paired differences only of those that flew the same trials."""
+    """The comparison on the page; paired differences only for controllers that flew the same trials."""
     judgements = [dataclasses.replace(one.judgement, name=name) for name, one in zip(names, evaluations, strict=True)]
     numbered = [(f"{number} {judgement.name}", judgement) for number, judgement in enumerate(judgements, start=1)]
     shown = {

@@ -1,4 +1,4 @@
-"""The page of a tuning: what was required and what was reached, the response of the result, and the reason of each edit."""
+"""The page of a tuning: what was required and reached, the response of the result, and the reason of each edit."""
 
 import math
 from collections.abc import Mapping

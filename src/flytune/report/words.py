@@ -16,7 +16,7 @@ COMMENT = re.compile(r"""^((?:"(?:\\.|[^"\\])*"|'[^']*'|[^"'#])*)(#.*)$""")  # a
 
 
 def summary(judgement: Judgement) -> dict[str, Any]:
-    """The flights in one sentence, as its parts: trials that settle on all axes, and the slowest axis or those that fail."""
+    """The parts of one sentence: trials that settle on all axes, and the slowest axis or the axes that fail."""
     settled = np.logical_and.reduce([np.isfinite(judgement.settling_time[axis]) for axis in AXES])
     judged = judgement.to_dict()["axes"]
     medians = {axis: judged[axis]["settling_time"]["median"] for axis in AXES}

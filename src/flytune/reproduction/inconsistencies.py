@@ -58,8 +58,8 @@ def _standing_still(evidence: Evidence) -> Inconsistency:
         for weights in ("last", "averaged"):
             response = evidence.response("inspection", weights)
             stood = [p[d > limit] < MOVED for p, d in zip(response.progress, response.distance, strict=True)]
-            what = f"inspection, {weights} weights: trials from beyond {limit:.2f} m that cover less than a tenth of the way"
-            measures.append(share_of_trials(what, stood, None))
+            what = f"inspection, {weights} weights: trials from beyond {limit:.2f} m"
+            measures.append(share_of_trials(f"{what} that cover less than a tenth of the way", stood, None))
     text = (
         "The discount decides whether flying to the target earns more than standing still. At 0.2 m/s and a discount "
         "of 0.99 the inspection reward is largest for standing still far from the target (an exact dynamic programme "
@@ -142,8 +142,8 @@ def _mean_rotor_speed(evidence: Evidence) -> Inconsistency:
             )
         )
     text = (
-        "The mean rotor speed of every controller that hovers is the hover speed. RMS and total variation of the action "
-        "tell controllers apart."
+        "The mean rotor speed of every controller that hovers is the hover speed. RMS and total variation of the "
+        "action tell controllers apart."
     )
     return Inconsistency(item="C6", text=text, measures=measures)
 

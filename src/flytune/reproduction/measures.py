@@ -1,4 +1,4 @@
-"""What is measured for each claim about flights, as printed and under our reading (`claims.toml` has the definitions)."""
+"""The measures of each claim about flights, as printed and under our reading (`claims.toml` has the definitions)."""
 
 import dataclasses
 import math

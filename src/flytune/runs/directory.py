@@ -119,7 +119,7 @@ class RunDirectory:
         return jax.tree.unflatten(structure, restored), rows
 
     def finish(self, policy: Policy, last_policy: Policy, last: dict[str, Any]) -> None:
-        """Write the policies, and into run.json that the training is complete; `last` is the last row of the metrics."""
+        """Write the policies, and run.json as of a complete training; `last` is the last row of the metrics."""
         save_policy(self.path / "policy.safetensors", policy)
         save_policy(self.path / "policy-last.safetensors", last_policy)
         finished = {"finished": True, "steps": last["steps"], "seconds": last["seconds"]}

@@ -58,7 +58,7 @@ def find_controller(name: str, task: str | Task | None = None) -> FoundControlle
     Args:
         name: `runs/baseline-apg-s0`, `policy.safetensors`, `policy.onnx`, a Stable-Baselines3 model `model.zip`,
             `pid`, `geometric` or `lqr` (gains tuned by search; `pid@textbook` for those of the books).
-        task: the task to fly, a preset, a TOML file or a task. Where None: the task it was trained for, or the baseline.
+        task: the task to fly, a preset, a TOML file or a task; where None, that of its training, or the baseline.
 
     Raises:
         BadInput: no controller has this name, or it cannot be used.

@@ -15,7 +15,7 @@ def shipped_names() -> list[str]:
 
 
 def shipped_name(task: str, trainer: str) -> str:
-    """The name of the policy that a trainer learned for a task: `TASK`, or `TASK@TRAINER` for another than the default."""
+    """The name of the policy that a trainer learned for a task: `TASK`, or `TASK@TRAINER` unless it is the default."""
     return task if trainer == DEFAULT_TRAINER else f"{task}@{trainer}"
 
 

@@ -1,7 +1,6 @@
 """Rotors for simulators that know only forces: action to rotor speed, with lag and latency. NumPy, float64.
 
-The equations are those of `physics.dynamics`, written once more because a simulator in C wants plain numbers and its
-own step.
+The equations are those of `physics.dynamics`, repeated because a simulator in C takes plain numbers and steps itself.
 """
 
 import numpy as np
@@ -21,7 +20,7 @@ class Actuator:
         self._pending = np.zeros((number, vehicle.action_latency_steps, 4))  # oldest first
 
     def place(self, rotor_speed_rpm: Float[np.ndarray, "K 4"], which: np.ndarray | None = None) -> None:
-        """Let the rotors turn at these speeds, with no action on its way to them; see `World.place`."""
+        """Let the rotors turn at these speeds, with no action on its way to them; see `Simulator.place`."""
         chosen = slice(None) if which is None else which
         self.rotor_speed_rpm[chosen] = rotor_speed_rpm
         self._pending[chosen] = 0.0

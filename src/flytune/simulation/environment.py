@@ -1,8 +1,8 @@
 """The environment: episodes of a task as pure functions for one vehicle; a rollout applies `vmap` to them.
 
-`reset` draws an episode, `observe` gives what a controller sees of it, `step` lets a control period pass and assesses the
-state it led to, and one of two endings says what comes after: `restart` begins a new episode where one is over, `hold`
-keeps a crashed vehicle where it is.
+`reset` draws an episode. `observe` returns what a controller sees of it. `step` simulates one control period and
+computes reward, margins and terminations of the new state. One of two endings follows: `restart` begins a new episode
+where one is over, `hold` keeps a crashed vehicle where it is.
 """
 
 import dataclasses
@@ -31,7 +31,7 @@ Physics = Callable[[Vehicle, State, Float[Array, "4"]], State]  # the state one 
 
 @pytree
 class Episode:
-    """Where an episode stands."""
+    """The state of an episode."""
 
     state: State
     last_action: Float[Array, "4"]  # the clipped action before; hover (0) after a reset
@@ -42,7 +42,7 @@ class Episode:
 
 @pytree
 class Outcome:
-    """What one step brought."""
+    """The result of one step."""
 
     reward: Float[Array, ""]
     terms: dict[str, Float[Array, ""]]  # the reward of each term; they add up to `reward`
@@ -78,7 +78,7 @@ def observe(task: Task, episode: Episode, normal: Float[Array, "13"]) -> Float[A
 def step(
     task: Task, episode: Episode, action: Float[Array, "4"], physics: Physics = dynamics.step
 ) -> tuple[Episode, Outcome]:
-    """The episode one control period later, and what the step brought, assessed on the true state it led to.
+    """The episode one control period later, and the result of the step, computed from the true state.
 
     The action is clipped to [-1, 1]; the clipped action is flown, penalised and later observed (paper R9).
     """
@@ -87,7 +87,7 @@ def step(
 
 
 def assess(task: Task, episode: Episode, state: State, action: Float[Array, "4"]) -> tuple[Episode, Outcome]:
-    """The episode in the state that a clipped action led to, and what that state is worth, in whichever simulator."""
+    """The episode in the state that a clipped action led to, and the result of the step, for any simulator."""
     here = situation(task.target, state, action - episode.last_action)
     terms = rewards(task.reward, here)
     left = margins(task.termination, here)

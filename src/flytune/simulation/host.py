@@ -29,7 +29,7 @@ Noise = Float[np.ndarray, "13 N"] | Float[Array, "13 N"]
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Transition:
-    """What one step of N episodes brought; with `restart`, one that ended has already begun its next episode."""
+    """The result of one step of N episodes; with `restart`, one that ended has already begun its next episode."""
 
     observation: np.ndarray  # [N, 17] what to act on next: of the new episode where the old one ended
     final_observation: np.ndarray  # [N, 17] of the state the action led to, before any new episode
@@ -56,7 +56,7 @@ def _stay(family: Any, before: Episode, moved: Episode, outcome: Any, key: None)
 ENDINGS: dict[str, Callable[..., Any]] = {
     "restart": environment.restart,  # an episode that is over is followed by a new one
     "hold": environment.hold,  # a crashed vehicle stays where it was
-    "none": _stay,  # what comes after the end is the caller's affair
+    "none": _stay,  # the caller decides what follows
 }
 
 
@@ -114,7 +114,7 @@ class HostEnvironment:
         return self.observation
 
     def step(self, action: np.ndarray, noise: Noise | None = None) -> Transition:
-        """What actions [N, 4] brought; they are clipped to [-1, 1].
+        """The result of actions [N, 4]; they are clipped to [-1, 1].
 
         Args:
             action: one per vehicle.

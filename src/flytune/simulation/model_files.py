@@ -1,4 +1,4 @@
-"""A vehicle as the files other simulators read: URDF and MJCF, with every number in full."""
+"""A vehicle as URDF and MJCF, the files of other simulators, with all digits of every number."""
 
 import math
 from collections.abc import Iterable

@@ -1,4 +1,4 @@
-"""MuJoCo as a world: the vehicle's MJCF, stepped for all vehicles at once."""
+"""MuJoCo as a simulator: the vehicle's MJCF, stepped for all vehicles at once."""
 
 from typing import Annotated
 
@@ -55,7 +55,7 @@ class MujocoSimulator:
         self._state[:, ATTITUDE] = 1.0, 0.0, 0.0, 0.0
 
     def place(self, states: VehicleStates, which: np.ndarray | None = None) -> None:
-        """Put the vehicles there, see `World`."""
+        """Put the vehicles there, see `Simulator`."""
         chosen = slice(None) if which is None else which
         self._state[chosen, POSITION] = states.position
         self._state[chosen, ATTITUDE] = states.attitude[:, W_FIRST]
@@ -64,7 +64,7 @@ class MujocoSimulator:
         self._actuator.place(states.rotor_speed_rpm, which)
 
     def advance(self, action: np.ndarray) -> None:
-        """Let one control period pass, see `World`."""
+        """Let one control period pass, see `Simulator`."""
         self._actuator.command(action)
         speeds = [self._actuator.turn(self._period) for _ in range(self._options.physics_steps)]
         controls = thrust(self._vehicle, np.stack(speeds, axis=1) ** 2)
@@ -73,7 +73,7 @@ class MujocoSimulator:
         self._state = np.array(states[:, -1])
 
     def states(self) -> VehicleStates:
-        """Where the vehicles are, see `World`."""
+        """Where the vehicles are, see `Simulator`."""
         state = self._state
         return VehicleStates(
             position=state[:, POSITION].copy(),

@@ -1,4 +1,4 @@
-"""PyBullet as a world: the paper's simulator (paper R6), with a force at each motor."""
+"""PyBullet as a simulator: the paper's simulator (paper R6), with a force at each motor."""
 
 import tempfile
 from pathlib import Path
@@ -38,7 +38,8 @@ class PyBulletSimulator:
 
     Bullet keeps the angular velocity in the inertial frame; it is turned into the body frame here. Its multibody
     solver, which URDF files are loaded into, has the gyroscopic torque, advances velocities first and positions with
-    them (semi-implicit Euler, first order), and forgets forces after each step. docs/results/worlds.md measures all of these.
+    them (semi-implicit Euler, first order), and forgets forces after each step. docs/results/worlds.md has
+    measurements.
     """
 
     physics = None
@@ -57,7 +58,7 @@ class PyBulletSimulator:
         self._drag = np.array(vehicle.drag, float)
         self._client = self._bullet.connect(self._bullet.DIRECT)
         if self._client < 0:
-            raise BadInput("pybullet: no client is left. Close a world that is no longer needed.")
+            raise BadInput("pybullet: no client is left. Close a simulator that is no longer needed.")
         self._bullet.setGravity(0, 0, -float(vehicle.gravity), physicsClientId=self._client)
         self._bullet.setTimeStep(self._period, physicsClientId=self._client)
         self._vehicles = self._load(number)
@@ -82,7 +83,7 @@ class PyBulletSimulator:
         return vehicles
 
     def place(self, states: VehicleStates, which: np.ndarray | None = None) -> None:
-        """Put the vehicles there, see `World`."""
+        """Put the vehicles there, see `Simulator`."""
         chosen = range(len(self._vehicles)) if which is None else which
         turning = to_inertial(np.asarray(states.attitude, float), np.asarray(states.body_rate, float))
         for row, index in enumerate(chosen):
@@ -96,7 +97,7 @@ class PyBulletSimulator:
         self._actuator.place(states.rotor_speed_rpm, which)
 
     def advance(self, action: np.ndarray) -> None:
-        """Let one control period pass, see `World`."""
+        """Let one control period pass, see `Simulator`."""
         self._actuator.command(action)
         for _ in range(self._options.physics_steps):
             self._push(self._actuator.turn(self._period))
@@ -128,7 +129,7 @@ class PyBulletSimulator:
         return forces * (1 + ground_effect(self._vehicle, body.position, body.attitude))
 
     def states(self) -> VehicleStates:
-        """Where the vehicles are, see `World`."""
+        """Where the vehicles are, see `Simulator`."""
         bullet, client = self._bullet, self._client
         places = [bullet.getBasePositionAndOrientation(vehicle, client) for vehicle in self._vehicles]
         motions = np.array([bullet.getBaseVelocity(vehicle, client) for vehicle in self._vehicles])

@@ -32,7 +32,7 @@ class Draw:
 
 
 class Step(NamedTuple):
-    """What a rollout gives for every step, [T, ...]."""
+    """The results of a rollout at every step, [T, ...]."""
 
     notes: Any  # what `decide` gave beside the action
     following: Any  # [T, N, 17] the observation after the step, where `Draw.next_noise` asks for it
@@ -58,7 +58,7 @@ def rollout(
     physics: Physics = dynamics.step,
     rematerialise: bool = False,
 ) -> tuple[tuple[Episode, Memory], Step]:
-    """Episodes and memory after all steps, and what each step gave.
+    """Episodes and memory after all steps, and the results of each step.
 
     The batch is the last axis of the episodes: arithmetic on one scalar per vehicle then runs along contiguous memory.
 

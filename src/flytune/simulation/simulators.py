@@ -12,13 +12,13 @@ SIMULATORS = ("flytune", "pybullet", "mujoco")
 
 
 def make_simulator(name: str, vehicle: Vehicle, number: int, options: Mapping[str, Any] | None = None) -> Simulator:
-    """A simulator with `number` vehicles of one kind in it, not placed yet.
+    """A simulator with `number` vehicles of one kind; `place` gives them their states.
 
     Args:
-        name: one of WORLDS.
+        name: one of `SIMULATORS`.
         vehicle: what is simulated.
         number: how many, 1 or more.
-        options: of that simulator: `PyBulletOptions`, `MujocoOptions`, `FlytuneOptions`.
+        options: of that simulator: `PyBulletOptions`, `MujocoOptions` or `JaxSimulatorOptions`.
 
     Raises:
         BadInput: an unknown name, an option that is unknown or out of range, or a simulator that is not installed.

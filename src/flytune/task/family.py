@@ -1,4 +1,4 @@
-"""Families of tasks: what a rollout flies, where some numbers of the task or the vehicle change from episode to episode."""
+"""Families of tasks, in which some numbers of the task or the vehicle change from episode to episode."""
 
 from typing import Any, Protocol, runtime_checkable
 

@@ -1,4 +1,4 @@
-"""Reward terms: what the controller is paid for, one small class per term (paper R10).
+"""Reward terms, one small class per term (paper R10).
 
 To add a term: write a class with a `kind`, annotated numbers and `__call__(situation)`, and name it in `RewardTerm`.
 """
@@ -22,7 +22,7 @@ Error = Literal["horizontal", "vertical", "position", "velocity", "attitude", "b
 def squared_error(situation: Situation, of: Error) -> Float[Array, ""]:
     """The square of the error a term looks at: m^2, (m/s)^2, rad^2 or (rad/s)^2.
 
-    Squares, because the exponentials want them and a square root has no gradient at the target.
+    The exponentials need squares, and a square root has no gradient at the target.
     """
     match of:
         case "horizontal":
@@ -58,7 +58,7 @@ class Survival:
 class Exponential:
     """Bounded reward for a small error: weight * exp(-sharpness * e^2), in [0, weight].
 
-    Its pull is strongest at e = 1 / sqrt(2 sharpness): a sharper term is more exact and reaches less far (H3).
+    Its gradient is largest at e = 1 / sqrt(2 sharpness): a sharper term is more accurate and reaches less far (H3).
 
     Source: paper R10.
     """
@@ -79,7 +79,7 @@ class DualExponential:
 
         reward(e) = weight * (share * exp(-wide * e^2) + (1 - share) * exp(-narrow * e^2))
 
-    `wide` decides how far away the controller is already paid to come closer; `narrow`, how exactly the target is held.
+    `wide` decides from how far away the reward grows towards the target; `narrow`, how accurately the target is held.
 
     Source: paper R10, alpha = weight * share, beta = weight * (1 - share).
     """

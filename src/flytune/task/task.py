@@ -1,4 +1,4 @@
-"""Task: everything that is wanted, in one file."""
+"""A task: target, initial states, noise, reward, terminations, vehicle and training settings, in one file."""
 
 import os
 import re
@@ -37,7 +37,7 @@ RENAMED = {
 
 @pytree
 class Task:
-    """What a controller is asked to do, with which vehicle, and how it is trained for it."""
+    """What a controller has to do, with which vehicle, and how it is trained."""
 
     name: str = label(default="custom")
     horizon: Annotated[

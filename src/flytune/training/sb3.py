@@ -37,7 +37,7 @@ LOSSES = {  # our names -> what Stable-Baselines3 logs
     "std": "train/std",
 }
 
-# parts of the errors that follow from numbers that are not finite: of torch's Gaussian, of Adam, of flytune's environments
+# parts of the errors that numbers which are not finite cause in torch's Gaussian, in Adam, in flytune's environments
 DIVERGENCE = ("Expected parameter", "overflow", "not finite")
 
 

@@ -62,7 +62,7 @@ def heuristics_tables(sensitivities: Sensitivities) -> str:
 
 
 def draw_sensitivities(path: Path, sensitivities: Sensitivities) -> None:
-    """Write the sensitivities as an SVG: one row per measure, one column per parameter, median and range of the seeds."""
+    """Write the sensitivities as SVG: one row per measure, one column per parameter, median and range of the seeds."""
     with mpl.rc_context(
         {"svg.fonttype": "none", "svg.hashsalt": "flytune", "font.size": 8, "font.family": "sans-serif"}
     ):

@@ -201,7 +201,8 @@ class Tuner:
         outcome = messages.describe_misses(validation.misses, self.requirement)
         self._say(
             "validation",
-            f"iteration {iteration.number} in {VALIDATION_TRIALS} trials with new initial conditions: {text}; {outcome}",
+            f"iteration {iteration.number} in {VALIDATION_TRIALS} trials with new initial conditions: {text}; "
+            f"{outcome}",
         )
         return validation
 

@@ -44,7 +44,8 @@ def describe_target(target: Requirement, trials: int, duration: float) -> str:
     band = "3.6 deg" if target.axis == "yaw" else "2 cm"
     return (
         f"{trials} trials of {duration:g} s; required there: {time}, overshoot at most "
-        f"{with_unit('overshoot', target.overshoot, target)}, error at most {with_unit('error', target.error, target)}. "
+        f"{with_unit('overshoot', target.overshoot, target)}, error at most "
+        f"{with_unit('error', target.error, target)}. "
         f"A trial has settled if it stays within {band} until its end; a trial that has not counts as infinitely slow"
     )
 

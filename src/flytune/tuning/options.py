@@ -1,4 +1,4 @@
-"""The options for the next edit of an iteration: the edit that each rule proposes, and what remains to be improved after it."""
+"""The options for the next edit of an iteration: the edit of each rule, and the predicted distance after it."""
 
 import dataclasses
 import math

@@ -79,7 +79,7 @@ class Requirement:
         return self.settling_time * (1.0 - self.tolerance / 2 if self.at_most else 1.0)
 
     def measure(self, *judgements: Judgement, constraints: tuple[str, ...] = ()) -> ResponseSummary:
-        """The summary over all trials of one or more judgements; `constraints` names the terminations the user has set."""
+        """The summary over all trials of some judgements; `constraints` names the terminations the user has set."""
 
         def all_of(values: Callable[[Judgement], np.ndarray]) -> np.ndarray:
             return np.concatenate([values(judgement) for judgement in judgements])

@@ -109,9 +109,9 @@ def _prepared(task: Task, requirement: Requirement, trainer: str, warm_start: bo
     }
     if horizon > task.horizon:
         wanted["horizon"] = (horizon, "tuned: the episodes last longer than the wanted response")
-    learner = find_trainer(trainer)
-    settings = learner.settings(task).tuned(slow=requirement.settling_time >= SLOW, warm_start=warm_start)
-    wanted |= {f"{learner.settings_field}.{name}": change for name, change in settings.items()}
+    method = find_trainer(trainer)
+    settings = method.settings(task).tuned(slow=requirement.settling_time >= SLOW, warm_start=warm_start)
+    wanted |= {f"{method.settings_field}.{name}": change for name, change in settings.items()}
     return edited(task, {path: what for path, what in wanted.items() if not is_fixed(path, fixed)})
 
 
@@ -133,7 +133,7 @@ def _shipped(name: str, task: Task, trainer: str) -> tuple[Path, Path] | None:
     """The policy that ships for a known task, unless the user has set other hidden layers."""
     if name not in KNOWN:
         return None
-    learner, known = find_trainer(trainer), shipped_name(name, trainer)
-    if learner.supports_warm_start and learner.settings(task).hidden != learner.settings(load_task(name)).hidden:
+    method, known = find_trainer(trainer), shipped_name(name, trainer)
+    if method.supports_warm_start and method.settings(task).hidden != method.settings(load_task(name)).hidden:
         return None
     return shipped_files(known) if known in shipped_names() else None

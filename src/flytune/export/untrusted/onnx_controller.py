@@ -72,7 +72,8 @@ def load_onnx(path: Path) -> OnnxController:
         raise BadInput(f"{path}: cannot be read ({error.strerror}). Give an .onnx policy.") from None
     if len(content) > LARGEST:
         raise BadInput(
-            f"{path}: is larger than {LARGEST // 10**6} MB. Allowed: a policy of up to that size; give a smaller network."
+            f"{path}: is larger than {LARGEST // 10**6} MB. Allowed: a policy of up to that size. "
+            "Give a smaller network."
         )
     return read_onnx(content, str(path))
 
