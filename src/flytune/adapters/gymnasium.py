@@ -116,12 +116,12 @@ class HoverEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         moved = self._environment.step(read_action(action, (4,))[None], self._noise())
         terminated, truncated = bool(moved.terminated[0]), bool(moved.truncated[0])
         self._steps, self._reward = self._steps + 1, float(moved.reward[0])
-        self._trail.append(moved.states[0, :3])
+        self._trail.append(self._environment.states[0, :3])
         if terminated or truncated:
             self._state = "ended"
         terms = {name: float(reward[0]) for name, reward in moved.terms.items()}
         info = {"reward_terms": terms, "termination": self._causes[moved.cause[0]] if terminated else None}
-        return moved.observation[0], self._reward, terminated, truncated, info
+        return self._environment.observation[0], self._reward, terminated, truncated, info
 
     def render(self) -> np.ndarray | None:  # pyright: ignore[reportIncompatibleMethodOverride]
         """A picture [480, 480, 3] of the present state, or None without a render mode.

@@ -80,20 +80,17 @@ class HoverVecEnv(VecEnv):
         """Observations [N, 17], rewards [N], whether an episode ended [N], and N infos."""
         self.transition = now = self.environment.step(self._action)
         infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
-        for index in np.flatnonzero(now.ended):
-            failed = bool(now.terminated[index])
-            infos[index] = {
-                "terminal_observation": now.final_observation[index],
-                "TimeLimit.truncated": not failed,
-                "cause": self._names[now.cause[index]] if failed else "horizon",
-                "episode": {
-                    "r": float(now.episode_return[index]),
-                    "l": int(now.episode_length[index]),
-                    "t": round(time.monotonic() - self._started, 6),
-                },
-            }
-        # a copy, since trainers add the value of what a truncated episode would still have earned
-        return now.observation, now.reward.copy(), now.ended, infos
+        if (ended := now.ended).any():
+            failed, cause, final = now.terminated, now.cause, now.final_observation
+            total, length, elapsed = now.episode_return, now.episode_length, time.monotonic() - self._started
+            for index in np.flatnonzero(ended):
+                infos[index] = {
+                    "terminal_observation": final[index],
+                    "TimeLimit.truncated": not failed[index],
+                    "cause": self._names[cause[index]] if failed[index] else "horizon",
+                    "episode": {"r": float(total[index]), "l": int(length[index]), "t": round(elapsed, 6)},
+                }
+        return self.environment.observation, now.reward, ended, infos
 
     def close(self) -> None:
         """Give the simulator's memory back."""

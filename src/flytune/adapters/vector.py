@@ -112,9 +112,10 @@ class HoverVectorEnv(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarr
         if self._environment is None:
             raise gymnasium.error.ResetNeeded("step() was called before the first reset. Call reset() first.")
         moved = self._environment.step(read_action(actions, (self.num_envs, 4)))
-        self._reward = np.where(moved.ended, 0.0, moved.reward)
+        reward, observation = moved.reward, self._environment.observation
+        self._reward = np.where(moved.ended, 0.0, reward)
         self._follow()
-        return moved.observation, moved.reward, moved.terminated, moved.truncated, self._infos(moved)
+        return observation, reward, moved.terminated, moved.truncated, self._infos(moved)
 
     def render(self) -> tuple[np.ndarray, ...] | None:
         """A picture [480, 480, 3] of each environment, or None without a render mode.
@@ -148,9 +149,9 @@ class HoverVectorEnv(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarr
         ended = moved.ended
         infos = self._account(moved, ~ended)
         if ended.any():
-            final = np.full(self.num_envs, None, dtype=object)
+            final, last = np.full(self.num_envs, None, dtype=object), moved.final_observation
             for index in np.flatnonzero(ended):
-                final[index] = moved.final_observation[index]
+                final[index] = last[index]
             infos |= {"final_obs": final, "_final_obs": ended}
             infos |= {"final_info": self._account(moved, ended), "_final_info": ended.copy()}
         return infos

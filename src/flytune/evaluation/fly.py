@@ -147,8 +147,8 @@ def _rollout_on_host(
             trial = int(np.argmin(finite))
             raise _not_finite(name, given[trial], trial, index)
         moved = environment.step(np.asarray(action), _noise(noise_keys, index + 1))
-        seen, crashed = moved.observation, moved.crashed
-        states.append(moved.states.T)
+        seen, crashed = environment.observation, moved.crashed
+        states.append(environment.states.T)
         actions.append(seen[:, ACTION].T)
     return Record(np.stack(states), np.stack(actions), crashed)
 

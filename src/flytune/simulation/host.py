@@ -27,26 +27,93 @@ from flytune.task.task import Task
 Noise = Float[np.ndarray, "13 N"] | Float[Array, "13 N"]
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
+@dataclasses.dataclass(frozen=True, eq=False)
 class Transition:
-    """The result of one step of N episodes; with `restart`, one that ended has already begun its next episode."""
+    """The result of one step of N episodes; with `restart`, one that ended has already begun its next episode.
 
-    observation: np.ndarray  # [N, 17] what to act on next: of the new episode where the old one ended
-    final_observation: np.ndarray  # [N, 17] of the state the action led to, before any new episode
-    states: np.ndarray  # [N, 17] position, attitude, velocity, body rate, rotor speeds in rpm; of `observation`
-    reward: np.ndarray  # [N]
-    terms: dict[str, np.ndarray]  # [N] each: the reward of each term; they add up to `reward`
-    terminated: np.ndarray  # [N] bool; failed, nothing comes after
-    truncated: np.ndarray  # [N] bool; the horizon is reached, what would come after still counts
-    cause: np.ndarray  # [N] int; why it failed, an index into `causes(task.termination)`, or SAFE
-    episode_return: np.ndarray  # [N] sum of rewards since the episode's start, this step included
-    episode_length: np.ndarray  # [N] int; steps since the episode's start, this one included
-    crashed: np.ndarray  # [N] bool; with `hold`: the vehicle has crashed, in this step or before
+    The report holds everything in one array. Its parts are computed when they are asked for, since most callers need
+    few of them. The reports of T steps, stacked, give all parts with a first axis of time.
+    """
+
+    report: np.ndarray  # [..., rows, N], see `_step`
+    term_names: tuple[str, ...]
+    holds: bool = False  # a crashed vehicle stays where it was
+
+    @property
+    def observation(self) -> np.ndarray:
+        """[N, 17] The next observation, of the new episode where the old one ended."""
+        return self._vectors(0)
+
+    @property
+    def final_observation(self) -> np.ndarray:
+        """[N, 17] The observation of the state the action led to, before any new episode."""
+        return self._vectors(1)
+
+    @property
+    def states(self) -> np.ndarray:
+        """[N, 17] The states of `observation`: position, attitude, velocity, body rate, rotor speeds in rpm."""
+        return self._vectors(2)
+
+    @property
+    def placed(self) -> np.ndarray:
+        """[N, 17] The states for a simulator that JAX cannot look into, where an episode has ended."""
+        return self._vectors(3)
+
+    @property
+    def reward(self) -> np.ndarray:
+        """[N]"""
+        return self._number(0)
+
+    @property
+    def cause(self) -> np.ndarray:
+        """[N] int; why an episode failed, an index into `causes(task.termination)`, or SAFE."""
+        return self._number(1).astype(np.int64)
+
+    @property
+    def terminated(self) -> np.ndarray:
+        """[N] bool; the episode failed, nothing comes after."""
+        return self._number(1) >= 0
+
+    @property
+    def truncated(self) -> np.ndarray:
+        """[N] bool; the horizon is reached, the rewards that would follow still count."""
+        return self._number(2) > 0
+
+    @property
+    def episode_return(self) -> np.ndarray:
+        """[N] The sum of rewards since the start of the episode, this step included."""
+        return self._number(3)
+
+    @property
+    def episode_length(self) -> np.ndarray:
+        """[N] int; the steps since the start of the episode, this one included."""
+        return self._number(4).astype(np.int64)
 
     @property
     def ended(self) -> np.ndarray:
-        """Which episodes are over by a termination or by the horizon, [N] bool."""
+        """[N] bool; the episode is over by a termination or by the horizon."""
         return self.terminated | self.truncated
+
+    @property
+    def over(self) -> np.ndarray:
+        """[N] bool; the episode is over by the rule of the environment: ended, or with `hold` crashed."""
+        return self._number(5) > 0
+
+    @property
+    def crashed(self) -> np.ndarray:
+        """[N] bool; with `hold`: the vehicle has crashed, in this step or before."""
+        return self.over & self.holds
+
+    @property
+    def terms(self) -> dict[str, np.ndarray]:
+        """[N] each: the reward of each term; they add up to `reward`."""
+        return {name: self._number(index) for index, name in enumerate(self.term_names, start=6)}
+
+    def _vectors(self, block: int) -> np.ndarray:
+        return self.report[..., WIDTH * block : WIDTH * (block + 1), :].swapaxes(-1, -2).copy()
+
+    def _number(self, index: int) -> np.ndarray:
+        return self.report[..., 4 * WIDTH + index, :].astype(float)
 
 
 def _stay(family: Any, before: Episode, moved: Episode, outcome: Any, key: None) -> tuple[Episode, Array]:
@@ -78,7 +145,7 @@ class HostEnvironment:
         leaves, structure = jax.tree.flatten(task)
         self._numbers = jnp.asarray(np.asarray(leaves, np.float32))
         self._structure, self._ending = structure, ending
-        self._terms = sorted(task.reward)
+        self._terms = tuple(sorted(task.reward))
         self.key: Any = None  # of noise and new episodes, where `step` is given none
         self.episodes: Any = np.zeros((0, number), np.float32)  # [K, N], see `unravel`
         self.observation = np.zeros((number, SIZE), np.float32)
@@ -128,31 +195,16 @@ class HostEnvironment:
         how = (self._structure, self._ending, physics)
         key = self.key if noise is None or self._ending == "restart" else None
         self.key, self.episodes, report = _step(*how, self._numbers, self.episodes, key, action, noise, reached)
-        return self._told(np.array(report))
-
-    def _told(self, report: np.ndarray) -> Transition:
-        cuts = np.cumsum([SIZE, SIZE, WIDTH, WIDTH])
-        seen, final, states, placed, outcome = np.split(report, cuts)
-        reward, cause, truncated, total, length, over, *terms = outcome.astype(float)
-        self.observation, self.states, ended = seen.T.copy(), states.T.copy(), over > 0
-        new = np.flatnonzero(ended & ~self._parked)
-        if self.simulator.physics is None and self._ending != "none" and len(new):
-            self.simulator.place(VehicleStates.from_rows(placed.T[new]), new)
-        if self._ending == "hold":
-            self._parked = ended
-        return Transition(
-            observation=self.observation,
-            final_observation=final.T.copy(),
-            states=self.states,
-            reward=reward,
-            terms=dict(zip(self._terms, terms, strict=True)),
-            terminated=cause >= 0,
-            truncated=truncated > 0,
-            cause=cause.astype(np.int64),
-            episode_return=total,
-            episode_length=length.astype(np.int64),
-            crashed=ended if self._ending == "hold" else np.zeros(self.number, bool),
-        )
+        transition = Transition(np.array(report), self._terms, self._ending == "hold")
+        self.observation, self.states = transition.observation, transition.states
+        if physics is None and self._ending != "none":
+            over = transition.over
+            new = np.flatnonzero(over & ~self._parked)
+            if len(new):
+                self.simulator.place(VehicleStates.from_rows(transition.placed[new]), new)
+            if self._ending == "hold":
+                self._parked = over
+        return transition
 
     def steps(self) -> np.ndarray:
         """How many steps old each episode is, [N] int."""

@@ -8,6 +8,7 @@ environments, and read from them afterwards. So a checkpoint is complete, and a 
 # PyTorch is in no pinned requirement; without it the rest is checked all the same
 
 import contextlib
+import dataclasses
 import random
 from collections.abc import Iterator
 from typing import Any
@@ -21,7 +22,6 @@ from flytune.config.pytree import pytree, static
 from flytune.control.policy import Network, Policy
 from flytune.errors import Diverged
 from flytune.export.untrusted.sb3_model import actor_network
-from flytune.simulation.host import Transition
 from flytune.task.observation import SIZE
 from flytune.task.task import Task
 from flytune.task.training_settings import PpoSettings
@@ -220,7 +220,7 @@ class _Model:
                 "A smaller learning_rate, or smaller weights in the reward, may help."
             ) from None
         logged = self.model.logger.name_to_value
-        steps = Transition(**jax.tree.map(lambda *each: np.stack(each), *map(vars, transitions)))
+        steps = dataclasses.replace(transitions[0], report=np.stack([each.report for each in transitions]))
         metrics = rollout_metrics(self.task, steps, steps.episode_return, steps.episode_length)
         return metrics | {name: np.asarray(logged[key]) for name, key in LOSSES.items()}
 
