@@ -11,8 +11,7 @@ import pytest
 from flytune.config.pytree import pytree
 from flytune.simulation.environment import hold
 from flytune.simulation.rollout import Draw, reset_all, rollout
-from flytune.task.family import TaskFamily
-from flytune.task.task import Task, load_task
+from flytune.task.task import Task, TaskFamily, load_task
 
 NUMBER, STEPS = 5, 30
 

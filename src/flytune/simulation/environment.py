@@ -20,10 +20,9 @@ from flytune.physics.rotation import safe_norm
 from flytune.physics.vehicle import Vehicle
 from flytune.simulation import CRASH_DISTANCE
 from flytune.task import observation
-from flytune.task.family import TaskFamily
 from flytune.task.reward import rewards
 from flytune.task.situation import position_error, situation
-from flytune.task.task import Task
+from flytune.task.task import Task, TaskFamily
 from flytune.task.termination import SAFE, cause, margins
 
 Physics = Callable[[Vehicle, State, Float[Array, "4"]], State]  # the state one control period later, in JAX

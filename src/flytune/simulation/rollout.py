@@ -16,7 +16,7 @@ from flytune.config.pytree import pytree
 from flytune.physics import dynamics
 from flytune.simulation import environment
 from flytune.simulation.environment import Episode, Physics
-from flytune.task.family import TaskFamily
+from flytune.task.task import TaskFamily
 
 Memory = Any  # a controller's pytree, the batch along the first axis
 

@@ -4,7 +4,7 @@ import os
 import re
 from importlib import resources
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Protocol, runtime_checkable
 
 import jax
 from annotated_types import Ge, Gt, Le, Unit
@@ -86,6 +86,22 @@ class Task:
         if not re.fullmatch(r"[\w .+-]{1,100}", self.name):
             return f"name: {self.name[:100]!r} cannot name a run. Allowed: up to 100 letters, digits and . _ + - signs."
         return None
+
+
+@runtime_checkable
+class TaskFamily(Protocol):
+    """Tasks of one structure that differ in numbers: a bound that a dial sets, a mass that is drawn per episode.
+
+    A `Task` is the family of one: its `draw` draws nothing, and its `member` is the task itself.
+    """
+
+    def draw(self, key: jax.Array) -> tuple[Any, jax.Array]:
+        """The numbers of one episode, a pytree of scalars, and the key that is left for its initial state."""
+        ...
+
+    def member(self, numbers: Any) -> Task:
+        """The task with these numbers; inside compiled code they are tracers."""
+        ...
 
 
 def preset_names() -> list[str]:

@@ -3,16 +3,12 @@
 A condition returns a margin, the share of its bound that is left: positive inside, zero at the bound, negative beyond.
 Training, barriers, evaluation and plots all read the same margins.
 
-To add a condition: write a class with a `kind`, a bound, `margin(situation)`, and what every condition has beside them,
-and name the class in `Termination`:
-
-    quantity   what is bounded: altitude, distance, attitude_error, tilt, speed or body_rate
-    key        the field that holds the bound, for error messages and edits
-    limit      the bound in SI units (m, m/s, rad, rad/s)
+To add a condition: write a subclass of `Bounded` with a `kind`, a bound and `margin(situation)`, and name it in
+`Termination`.
 """
 
 import math
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 import jax.numpy as jnp
 from annotated_types import Gt, Le, Unit
@@ -27,18 +23,29 @@ from flytune.task.situation import Situation
 SAFE = -1  # cause of an episode that goes on
 
 
-@pytree
-class MinimumAltitude:
-    """Ends an episode that sinks below `bound`. Source: paper R14, 0.1 m."""
+class Bounded:
+    """What every condition has beside its margin.
 
-    quantity, key = "altitude", "bound"
-    kind: Literal["minimum_altitude"] = static(default="minimum_altitude")
-    bound: Annotated[Real, Gt(0), Unit("m")]
+    `quantity` is what is bounded: altitude, distance, attitude_error, tilt, speed or body_rate. `key` is the field that
+    holds the bound.
+    """
+
+    quantity: ClassVar[str]
+    key: ClassVar[str] = "bound"
 
     @property
     def limit(self) -> Any:
-        """The bound in m."""
-        return self.bound
+        """The bound in SI units: m, m/s, rad or rad/s."""
+        return getattr(self, self.key)
+
+
+@pytree
+class MinimumAltitude(Bounded):
+    """Ends an episode that sinks below `bound`. Source: paper R14, 0.1 m."""
+
+    quantity = "altitude"
+    kind: Literal["minimum_altitude"] = static(default="minimum_altitude")
+    bound: Annotated[Real, Gt(0), Unit("m")]
 
     def margin(self, situation: Situation) -> Float[Array, ""]:
         """(z - bound) / bound: zero at the bound, one at twice its height."""
@@ -46,17 +53,12 @@ class MinimumAltitude:
 
 
 @pytree
-class MaximumDistance:
+class MaximumDistance(Bounded):
     """Ends an episode that strays from its target (H11). Source: paper R14, 3.0 m."""
 
-    quantity, key = "distance", "bound"
+    quantity = "distance"
     kind: Literal["maximum_distance"] = static(default="maximum_distance")
     bound: Annotated[Real, Gt(0), Unit("m")]
-
-    @property
-    def limit(self) -> Any:
-        """The bound in m."""
-        return self.bound
 
     def margin(self, situation: Situation) -> Float[Array, ""]:
         """Share of the bound that is left: 1 at the target."""
@@ -64,20 +66,15 @@ class MaximumDistance:
 
 
 @pytree
-class MaximumAttitudeError:
+class MaximumAttitudeError(Bounded):
     """Ends an episode whose geodesic attitude error is too large (H11).
 
     Source: paper R14, pi: never true of an angle in [0, pi], and kept because it is printed (C9).
     """
 
-    quantity, key = "attitude_error", "bound"
+    quantity = "attitude_error"
     kind: Literal["maximum_attitude_error"] = static(default="maximum_attitude_error")
     bound: Annotated[Real, Gt(0), Le(math.pi), Unit("rad")]
-
-    @property
-    def limit(self) -> Any:
-        """The bound in rad."""
-        return self.bound
 
     def margin(self, situation: Situation) -> Float[Array, ""]:
         """Share of the bound that is left: 1 at the target's attitude."""
@@ -85,7 +82,7 @@ class MaximumAttitudeError:
 
 
 @pytree
-class MaximumTilt:
+class MaximumTilt(Bounded):
     """Ends an episode that rolls or pitches too far, in place of the geodesic bound (H10). Source: paper R14."""
 
     quantity, key = "tilt", "bound_deg"
@@ -103,20 +100,15 @@ class MaximumTilt:
 
 
 @pytree
-class MaximumSpeed:
+class MaximumSpeed(Bounded):
     """Ends an episode that flies too fast; the strongest parameter on settling time (H7).
 
     Source: paper R14: 0.8 m/s baseline, 1.0 acrobatic, 0.2 inspection.
     """
 
-    quantity, key = "speed", "bound"
+    quantity = "speed"
     kind: Literal["maximum_speed"] = static(default="maximum_speed")
     bound: Annotated[Real, Gt(0), Unit("m/s")]
-
-    @property
-    def limit(self) -> Any:
-        """The bound in m/s."""
-        return self.bound
 
     def margin(self, situation: Situation) -> Float[Array, ""]:
         """Share of the bound that is left: 1 at rest."""
@@ -124,7 +116,7 @@ class MaximumSpeed:
 
 
 @pytree
-class MaximumBodyRate:
+class MaximumBodyRate(Bounded):
     """Ends an episode that turns too fast (H8, H9). Reading: the norm of the rate, in deg/s.
 
     Source: paper R14: 530 deg/s baseline and acrobatic, 115 inspection.

@@ -1,0 +1,41 @@
+# The public names, and where each of them comes from. The package imports a name when it is first used.
+from .benchmark.throughput import Throughput as Throughput
+from .benchmark.throughput import bench as bench
+from .control.classical import classical_controller as classical_controller
+from .control.policy import Policy as Policy
+from .control.policy import load_policy as load_policy
+from .control.policy import save_policy as save_policy
+from .errors import BadInput as BadInput
+from .errors import Diverged as Diverged
+from .errors import FlytuneError as FlytuneError
+from .errors import Interrupted as Interrupted
+from .errors import Unmet as Unmet
+from .evaluation.comparison import Comparison as Comparison
+from .evaluation.comparison import compare as compare
+from .evaluation.evaluate import Evaluation as Evaluation
+from .evaluation.evaluate import evaluate as evaluate
+from .evaluation.evaluate import evaluate_all as evaluate_all
+from .evaluation.flights import Flights as Flights
+from .evaluation.fly import fly as fly
+from .evaluation.judge import Judgement as Judgement
+from .evaluation.judge import judge as judge
+from .export import export_policy as export_policy
+from .export.onnx import save_onnx as save_onnx
+from .export.untrusted.onnx_controller import load_onnx as load_onnx
+from .physics.vehicle import Vehicle as Vehicle
+from .physics.vehicle import load_vehicle as load_vehicle
+from .report.report import write_report as write_report
+from .reproduction.reproduction import Reproduction as Reproduction
+from .reproduction.reproduction import reproduce as reproduce
+from .runs.find import FoundController as FoundController
+from .runs.find import find_controller as find_controller
+from .task.task import Task as Task
+from .task.task import load_task as load_task
+from .task.task import write_task as write_task
+from .training.loop import Run as Run
+from .training.loop import train as train
+from .tuning.result import Tuning as Tuning
+from .tuning.rules import load_rules as load_rules
+from .tuning.tune import tune as tune
+
+__version__: str
