@@ -30,8 +30,7 @@ import tomlkit
 import flytune
 from flytune.config import document
 from flytune.control.classical import CLASSICAL, AnyGains, controller_with, read_gains
-from flytune.errors import FlytuneError
-from flytune.extras import require
+from flytune.errors import FlytuneError, require
 from flytune.task.task import Task
 
 STARTS_SEED = 900_001  # evaluation uses 0 to 10

@@ -1,4 +1,7 @@
-"""The few exceptions a user can meet, each with the exit code of the command line."""
+"""The exceptions a user can meet, each with its exit code; and the import of optional packages, which may raise one."""
+
+from importlib import import_module
+from types import ModuleType
 
 
 class FlytuneError(Exception):
@@ -29,3 +32,21 @@ class Interrupted(FlytuneError):
     """The user stopped a training; the text names the checkpoint that was saved."""
 
     exit_code = 130
+
+
+def require(package: str, extra: str) -> ModuleType:
+    """The module of an optional package.
+
+    Args:
+        package: what to import, for instance `onnxruntime`.
+        extra: the extra of flytune that brings it, for instance `onnx`.
+
+    Raises:
+        BadInput: it is not installed; the line names the command that installs it.
+    """
+    try:
+        return import_module(package)
+    except ModuleNotFoundError as error:
+        if error.name != package.partition(".")[0]:
+            raise  # the package is there and lacks something of its own
+        raise BadInput(f'{package}: is not installed. Install it with: pip install "flytune[{extra}]"') from None

@@ -23,7 +23,7 @@ from flytune.adapters.hover import (
     take_picture,
 )
 from flytune.adapters.vector import HoverVectorEnv
-from flytune.extras import require
+from flytune.errors import require
 from flytune.physics.dynamics import hovering
 from flytune.physics.rotation import from_euler
 from flytune.simulation.host import HostEnvironment, draw_episodes, episodes_at

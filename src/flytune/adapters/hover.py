@@ -5,8 +5,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from flytune.errors import BadInput
-from flytune.extras import require
+from flytune.errors import BadInput, require
 from flytune.physics.dynamics import CONTROL_PERIOD
 from flytune.physics.rotors import places
 from flytune.simulation.simulator import VehicleStates

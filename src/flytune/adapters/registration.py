@@ -7,7 +7,7 @@ import: `gymnasium.make("flytune.adapters.registration:flytune/Hover-v0")`.
 Source: Gymnasium 1.0.0a1 release notes, "Removing the plugin system".
 """
 
-from flytune.extras import require
+from flytune.errors import require
 
 HOVER = "flytune/Hover-v0"
 

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from flytune.extras import require
+from flytune.errors import require
 from flytune.simulation.host import HostEnvironment, Transition
 from flytune.simulation.simulators import make_simulator
 from flytune.task.observation import SIZE

@@ -16,8 +16,7 @@ from flytune.adapters.hover import (
     read_task,
     take_picture,
 )
-from flytune.errors import BadInput
-from flytune.extras import require
+from flytune.errors import BadInput, require
 from flytune.simulation.host import HostEnvironment, Transition
 from flytune.simulation.simulators import make_simulator
 from flytune.task.task import Task

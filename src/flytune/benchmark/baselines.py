@@ -12,8 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from flytune.errors import BadInput
-from flytune.extras import require
+from flytune.errors import BadInput, require
 from flytune.tables import NULL, Column, Table
 from flytune.task.task import Task
 

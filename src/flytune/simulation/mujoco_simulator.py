@@ -7,7 +7,7 @@ from annotated_types import Ge, Le, Unit
 
 from flytune.config.document import Whole
 from flytune.config.pytree import pytree, static
-from flytune.extras import require
+from flytune.errors import require
 from flytune.physics.dynamics import CONTROL_PERIOD
 from flytune.physics.rotors import thrust
 from flytune.physics.vehicle import Vehicle

@@ -9,8 +9,7 @@ from annotated_types import Ge, Le, Unit
 
 from flytune.config.document import Real, Whole
 from flytune.config.pytree import pytree, static
-from flytune.errors import BadInput
-from flytune.extras import require
+from flytune.errors import BadInput, require
 from flytune.physics.dynamics import CONTROL_PERIOD
 from flytune.physics.rotors import spins, thrust
 from flytune.physics.vehicle import Vehicle

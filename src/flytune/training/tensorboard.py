@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any, Self
 
 from flytune.config.nested import leaves
-from flytune.extras import require
+from flytune.errors import require
 
 
 def check_tensorboard() -> None:

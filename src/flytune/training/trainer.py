@@ -11,8 +11,7 @@ import json
 from importlib import import_module
 from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
-from flytune.errors import BadInput
-from flytune.extras import require
+from flytune.errors import BadInput, require
 from flytune.runs.shipped import DEFAULT_TRAINER
 
 if TYPE_CHECKING:

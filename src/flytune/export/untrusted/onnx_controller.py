@@ -10,10 +10,9 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from flytune.config.pytree import label, pytree, static
-from flytune.errors import BadInput
+from flytune.errors import BadInput, require
 from flytune.export.untrusted.onnx_inspection import first_line, inspect, metadata
 from flytune.export.untrusted.onnx_session import CONVENTIONS, FORMAT, VERSION, Session, sample_observations
-from flytune.extras import require
 
 LARGEST = 100_000_000  # bytes; the network of the paper takes 25,000
 PROBES = 256

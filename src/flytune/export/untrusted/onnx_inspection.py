@@ -10,9 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from flytune.errors import BadInput
+from flytune.errors import BadInput, require
 from flytune.export.untrusted.onnx_session import CONVENTIONS, INPUT, OUTPUT
-from flytune.extras import require
 from flytune.task.observation import SIZE
 
 # fmt: off

@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float
 
 from flytune.control.policy import ACTION
-from flytune.extras import require
+from flytune.errors import require
 from flytune.task.observation import LAYOUT, SIZE
 
 INPUT, OUTPUT = "observation", "action"
