@@ -27,93 +27,60 @@ from flytune.task.task import Task
 Noise = Float[np.ndarray, "13 N"] | Float[Array, "13 N"]
 
 
+def _vectors(block: int) -> Any:
+    """A property: the vectors [N, 17] of one block of a report."""
+    rows = slice(WIDTH * block, WIDTH * (block + 1))
+    return property(lambda self: self.report[..., rows, :].swapaxes(-1, -2).copy())
+
+
+def _numbers(row: int, kind: type = float) -> Any:
+    """A property: the numbers [N] of one row of a report behind its four blocks."""
+    return property(lambda self: self.report[..., 4 * WIDTH + row, :].astype(kind))
+
+
 @dataclasses.dataclass(frozen=True, eq=False)
 class Transition:
     """The result of one step of N episodes; with `restart`, one that ended has already begun its next episode.
 
-    The report holds everything in one array. Its parts are computed when they are asked for, since most callers need
-    few of them. The reports of T steps, stacked, give all parts with a first axis of time.
+    The parts are computed from the report when they are asked for, since most callers need few of them. The reports of
+    T steps, stacked, give all parts with a first axis of time.
     """
 
     report: np.ndarray  # [..., rows, N], see `_step`
     term_names: tuple[str, ...]
     holds: bool = False  # a crashed vehicle stays where it was
 
-    @property
-    def observation(self) -> np.ndarray:
-        """[N, 17] The next observation, of the new episode where the old one ended."""
-        return self._vectors(0)
-
-    @property
-    def final_observation(self) -> np.ndarray:
-        """[N, 17] The observation of the state the action led to, before any new episode."""
-        return self._vectors(1)
-
-    @property
-    def states(self) -> np.ndarray:
-        """[N, 17] The states of `observation`: position, attitude, velocity, body rate, rotor speeds in rpm."""
-        return self._vectors(2)
-
-    @property
-    def placed(self) -> np.ndarray:
-        """[N, 17] The states for a simulator that JAX cannot look into, where an episode has ended."""
-        return self._vectors(3)
-
-    @property
-    def reward(self) -> np.ndarray:
-        """[N]"""
-        return self._number(0)
-
-    @property
-    def cause(self) -> np.ndarray:
-        """[N] int; why an episode failed, an index into `causes(task.termination)`, or SAFE."""
-        return self._number(1).astype(np.int64)
+    observation = _vectors(0)  # [N, 17] the next one, of the new episode where the old one ended
+    final_observation = _vectors(1)  # [N, 17] of the state the action led to, before any new episode
+    states = _vectors(2)  # [N, 17] of `observation`: position, attitude, velocity, body rate, rotor speeds in rpm
+    placed = _vectors(3)  # [N, 17] states for a simulator that JAX cannot look into, where an episode is over
+    reward = _numbers(0)  # [N]
+    cause = _numbers(1, int)  # [N] why an episode failed, an index into `causes(task.termination)`, or SAFE
+    truncated = _numbers(2, bool)  # [N] the horizon is reached; the rewards that would follow still count
+    episode_return = _numbers(3)  # [N] sum of the rewards of the episode, this step included
+    episode_length = _numbers(4, int)  # [N] steps of the episode, this one included
+    over = _numbers(5, bool)  # [N] the episode is over by the rule of the environment: ended, or with `hold` crashed
 
     @property
     def terminated(self) -> np.ndarray:
-        """[N] bool; the episode failed, nothing comes after."""
-        return self._number(1) >= 0
-
-    @property
-    def truncated(self) -> np.ndarray:
-        """[N] bool; the horizon is reached, the rewards that would follow still count."""
-        return self._number(2) > 0
-
-    @property
-    def episode_return(self) -> np.ndarray:
-        """[N] The sum of rewards since the start of the episode, this step included."""
-        return self._number(3)
-
-    @property
-    def episode_length(self) -> np.ndarray:
-        """[N] int; the steps since the start of the episode, this one included."""
-        return self._number(4).astype(np.int64)
+        """Which episodes failed, [N] bool; nothing comes after."""
+        return self.cause >= 0
 
     @property
     def ended(self) -> np.ndarray:
-        """[N] bool; the episode is over by a termination or by the horizon."""
+        """Which episodes are over by a termination or by the horizon, [N] bool."""
         return self.terminated | self.truncated
 
     @property
-    def over(self) -> np.ndarray:
-        """[N] bool; the episode is over by the rule of the environment: ended, or with `hold` crashed."""
-        return self._number(5) > 0
-
-    @property
     def crashed(self) -> np.ndarray:
-        """[N] bool; with `hold`: the vehicle has crashed, in this step or before."""
+        """Which vehicles have crashed, in this step or before, [N] bool; with `hold` only."""
         return self.over & self.holds
 
     @property
     def terms(self) -> dict[str, np.ndarray]:
-        """[N] each: the reward of each term; they add up to `reward`."""
-        return {name: self._number(index) for index, name in enumerate(self.term_names, start=6)}
-
-    def _vectors(self, block: int) -> np.ndarray:
-        return self.report[..., WIDTH * block : WIDTH * (block + 1), :].swapaxes(-1, -2).copy()
-
-    def _number(self, index: int) -> np.ndarray:
-        return self.report[..., 4 * WIDTH + index, :].astype(float)
+        """The reward of each term, [N] each; they add up to `reward`."""
+        rewards = self.report[..., 4 * WIDTH + 6 :, :].astype(float)
+        return {name: rewards[..., index, :] for index, name in enumerate(self.term_names)}
 
 
 def _stay(family: Any, before: Episode, moved: Episode, outcome: Any, key: None) -> tuple[Episode, Array]:
