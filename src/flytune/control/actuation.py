@@ -5,14 +5,14 @@ from typing import Any
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from flytune.physics.components import Components, pack
+from flytune.physics.components import Components, add, cross, pack
 from flytune.physics.dynamics import CONTROL_PERIOD, commanded_rotor_speed, rotor_speed_after
 from flytune.physics.rotors import directions
 from flytune.physics.vehicle import Vehicle
 
 
 def hovering_rotors(vehicle: Vehicle) -> Components:
-    """Four rotors at hover speed, in rpm: what a controller believes before its first observation."""
+    """Four rotors at hover speed, in rpm: the estimate before the first observation."""
     return tuple(jnp.full(4, vehicle.hover_rotor_speed_rpm, float))
 
 
@@ -24,6 +24,13 @@ def estimated_rotor_speed(vehicle: Vehicle, before: Components, last_action: Com
     """
     commanded = tuple(commanded_rotor_speed(vehicle, motor) for motor in last_action)
     return rotor_speed_after(vehicle, before, commanded, CONTROL_PERIOD)
+
+
+def torque_for(vehicle: Vehicle, angular_acceleration: Components, body_rate: Components) -> Components:
+    """The torque in N m that gives an angular acceleration in rad/s^2: J a + W x J W (Euler's equation)."""
+    momentum = tuple(i * w for i, w in zip(vehicle.inertia, body_rate, strict=True))
+    turning = tuple(i * a for i, a in zip(vehicle.inertia, angular_acceleration, strict=True))
+    return add(turning, cross(body_rate, momentum))
 
 
 def allocate(vehicle: Vehicle, thrust: Any, torque: Components) -> Components:
@@ -116,17 +123,11 @@ def action_for(
     """The action in [-1, 1]^4 that brings the rotors from the speeds they have to those wanted, all in rpm.
 
     A motor that lags is asked for more than is wanted, so that it closes the gap as fast as one with the shorter
-    time constant `motor_time_constant` would in the control period h:
+    time constant `motor_time_constant` in s would in the control period h:
 
         command = now + (wanted - now) (1 - exp(-h / motor_time_constant)) / (1 - exp(-h / tau))
 
-    A motor that is faster than that, or answers at once, is asked for what is wanted.
-
-    Args:
-        vehicle: whose rotors.
-        now: rotor speeds as estimated.
-        wanted: rotor speeds.
-        motor_time_constant: s; None asks for what is wanted.
+    A motor that is faster than that, or answers at once, is asked for what is wanted; without the constant, each is.
     """
     if motor_time_constant is not None:
         hurried = 1 - jnp.exp(-CONTROL_PERIOD / motor_time_constant)
