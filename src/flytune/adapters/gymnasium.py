@@ -73,12 +73,10 @@ class HoverEnv(gymnasium.Env[np.ndarray, np.ndarray]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, dict[str, Any]]:
-        """The observation at a new start, and an empty info.
+        """The observation at a new start, and an empty info; a seed makes everything that follows reproducible.
 
-        Args:
-            seed: makes everything that follows reproducible.
-            options: `position` [x, y, z] in metres and `yaw` in radians (0 where left out) start there, level and at
-                rest, instead of at a start drawn from the task's.
+        The options `position` [x, y, z] in metres and `yaw` in radians (0 where left out) replace the start drawn from
+        the task's by this one, level and at rest.
 
         Raises:
             BadInput: an unknown option or an impossible start.
@@ -139,16 +137,7 @@ class HoverVectorEnv(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarr
     An environment that ends starts anew in the same step (`AutoresetMode.SAME_STEP`): the observation is then the new
     episode's, and `final_obs` and `final_info` of the infos hold the last ones of the old episode.
 
-    Args:
-        num_envs: how many.
-        task: a preset, a .toml file, or a Task.
-        edits: field path -> value, applied to a preset or file.
-        simulator: "flytune", "pybullet" or "mujoco".
-        simulator_options: of that simulator, see `make_simulator`.
-        render_mode: None, or "rgb_array".
-
-    Raises:
-        BadInput: one of these is not allowed, or the simulator's package is not installed.
+    There are `num_envs` of them; the other arguments and their errors are those of `HoverEnv`.
     """
 
     metadata = METADATA | {"autoreset_mode": AutoresetMode.SAME_STEP}
@@ -180,11 +169,9 @@ class HoverVectorEnv(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarr
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, dict[str, Any]]:
-        """The observations at new starts, and an empty info.
+        """The observations at new starts, and an empty info; a seed makes everything that follows reproducible.
 
-        Args:
-            seed: makes everything that follows reproducible.
-            options: `reset_mask`, a boolean array of the environments to reset; all where it is left out.
+        The option `reset_mask` is a boolean array of the environments to reset; all are reset where it is left out.
 
         Raises:
             BadInput: an unknown option, or a mask that is none.

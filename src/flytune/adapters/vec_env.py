@@ -30,17 +30,10 @@ class HoverVecEnv(VecEnv):
 
     The info of a step is empty until an episode ends; it then holds `terminal_observation`, `TimeLimit.truncated`,
     `episode` with its return `r`, length `l` and time `t` in s as Stable-Baselines3's Monitor gives them, and `cause`,
-    the termination condition that was broken or "horizon". What every environment's last step brought, the reward of
-    each term among it, is in `transition`.
-
-    Args:
-        task: what is flown.
-        number: how many environments.
-        seed: of initial states and noise, until `seed` and `reset` are called.
-        simulator: "flytune", "pybullet" or "mujoco".
+    the termination condition that was broken or "horizon". The seed holds until `seed` and `reset` are called.
     """
 
-    transition: Transition | None = None
+    transition: Transition | None = None  # of the last step, with the reward of each term
 
     def __init__(self, task: Task, number: int, seed: int = 0, simulator: str = "flytune") -> None:
         self.task = task
@@ -97,7 +90,7 @@ class HoverVecEnv(VecEnv):
         self.environment.close()
 
     def get_attr(self, attr_name: str, indices: Indices = None) -> list[Any]:
-        """An attribute of each environment: what `set_attr` gave it, else that of the whole."""
+        """An attribute of each environment: the value from `set_attr`, else the shared one."""
         which = self._get_indices(indices)
         return [self._own[i][attr_name] if attr_name in self._own[i] else getattr(self, attr_name) for i in which]
 

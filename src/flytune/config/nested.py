@@ -9,13 +9,7 @@ LABELS = ("name", "sources")  # for people: two tasks that differ in nothing els
 
 
 def leaves(table: Mapping[str, Any], skip: Collection[str] = (), separator: str = ".") -> Iterator[tuple[str, Any]]:
-    """Path and value of everything that is no table, in the order of the tables.
-
-    Args:
-        table: nested tables.
-        skip: keys that are left out at every depth, with what is below them.
-        separator: what joins the keys of a path.
-    """
+    """Path and value of everything that is no table; keys in `skip` are left out at every depth."""
     for key, value in table.items():
         if key in skip:
             continue

@@ -24,6 +24,7 @@ ACTION = (
     "4 motors [-1, 1]: rotor speed = hover speed * (1 + action_scale * action); "
     "0 (+x, -y), 1 (-x, -y), 2 (-x, +y), 3 (+x, +y)"
 )
+CONVENTIONS = {"observation": observation.LAYOUT, "action": ACTION, "rate": "100 Hz"}  # in every policy's file
 
 
 @pytree
@@ -91,14 +92,7 @@ def save_policy(path: Path, policy: Policy) -> None:
     tensors = {"input_scale": np.asarray(policy.input_scale)}
     for part, layers in (("weight", policy.actor.weights), ("bias", policy.actor.biases)):
         tensors |= {f"actor.{index}.{part}": np.asarray(layer) for index, layer in enumerate(layers)}
-    header = {
-        "format": FORMAT,
-        "squash": policy.squash,
-        "observation": observation.LAYOUT,
-        "action": ACTION,
-        "rate": "100 Hz",
-        "about": policy.about,
-    }
+    header = {"format": FORMAT, "squash": policy.squash, **CONVENTIONS, "about": policy.about}
     write_bytes(path, safetensors.numpy.save(tensors, metadata={HEADER: json.dumps(header, sort_keys=True)}))
 
 

@@ -26,7 +26,7 @@ class Actuator:
         self._pending[chosen] = 0.0
 
     def command(self, action: Float[np.ndarray, "N 4"]) -> None:
-        """Take in the actions of a control period: what comes out of the latency now moves the motors.
+        """Accept the actions of a control period; those that the latency has delayed until now move the motors.
 
             rpm = min(hover speed * (1 + action_scale * clip(action, -1, 1)), maximum)
 
@@ -50,10 +50,7 @@ class Actuator:
 
     def _after(self, elapsed: float) -> Float[np.ndarray, "N 4"]:
         """The exact first-order response: command + (speed - command) exp(-t / tau), see `rotor_speed_after`."""
-        rise, fall = self._vehicle.motor_rise_time_constant, self._vehicle.motor_fall_time_constant
+        constants = self._vehicle.motor_rise_time_constant, self._vehicle.motor_fall_time_constant
+        rise, fall = (float(np.exp(-elapsed / constant)) if constant > 0 else 0.0 for constant in constants)
         now, goal = self.rotor_speed_rpm, self._commanded
-        return goal + (now - goal) * np.where(goal > now, _share_left(rise, elapsed), _share_left(fall, elapsed))
-
-
-def _share_left(time_constant: float, elapsed: float) -> float:
-    return float(np.exp(-elapsed / time_constant)) if time_constant > 0 else 0.0
+        return goal + (now - goal) * np.where(goal > now, rise, fall)

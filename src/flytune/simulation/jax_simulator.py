@@ -31,10 +31,10 @@ class JaxSimulator:
 
     def __init__(self, vehicle: Vehicle, number: int, options: JaxSimulatorOptions | None = None) -> None:
         self.physics = self._step = _physics((options or JaxSimulatorOptions()).physics_steps)
-        self._vehicle, self._latency = vehicle, vehicle.action_latency_steps
+        self._vehicle = vehicle
         hovering = np.asarray(state_numbers(dynamics.hovering(vehicle, (0.0, 0.0, 0.0))))
         self._numbers = np.repeat(hovering[:, None], number, axis=1)
-        self._pending = np.zeros((self._latency, 4, number), np.float32)
+        self._pending = np.zeros((vehicle.action_latency_steps, 4, number), np.float32)
 
     def place(self, states: VehicleStates, which: np.ndarray | None = None) -> None:
         """Put the vehicles there, see `Simulator`."""

@@ -53,11 +53,6 @@ def mjcf(vehicle: Vehicle, *, timestep: float = CONTROL_PERIOD / 2, integrator: 
 
     A motor's torque about z comes with its thrust, km / kf times as large. Rotor lag and latency are left to the
     caller, and so is drag, for which a free joint has one coefficient where a vehicle has three.
-
-    Args:
-        vehicle: what is described.
-        timestep: of the physics, s.
-        integrator: by MuJoCo's names.
     """
     ratio = float(vehicle.torque_coefficient / vehicle.thrust_coefficient)
     strongest = float(thrust(vehicle, vehicle.maximum_rotor_speed_rpm**2))
@@ -98,13 +93,8 @@ def mjcf(vehicle: Vehicle, *, timestep: float = CONTROL_PERIOD / 2, integrator: 
 """
 
 
-def motor_positions(vehicle: Vehicle) -> list[list[float]]:
-    """Where the four motors sit in the body frame, m."""
-    return [[float(x), float(y), 0.0] for x, y in places(vehicle)]
-
-
 def _motor_places(vehicle: Vehicle) -> list[str]:
-    return [_numbers(place) for place in motor_positions(vehicle)]
+    return [_numbers((x, y, 0.0)) for x, y in places(vehicle)]
 
 
 def _numbers(values: Iterable[float]) -> str:
@@ -112,5 +102,5 @@ def _numbers(values: Iterable[float]) -> str:
 
 
 def _name(vehicle: Vehicle) -> str:
-    """The vehicle's name, as far as XML takes it unquoted."""
+    """The vehicle's name, without the characters that XML does not allow unquoted."""
     return "".join(c for c in vehicle.name if c.isalnum() or c in " -_.@") or "vehicle"

@@ -1,7 +1,6 @@
 """PyBullet as a simulator: the paper's simulator (paper R6), with a force at each motor."""
 
 import tempfile
-from pathlib import Path
 from typing import Annotated
 
 import numpy as np
@@ -11,11 +10,11 @@ from flytune.config.document import Real, Whole
 from flytune.config.pytree import pytree, static
 from flytune.errors import BadInput, require
 from flytune.physics.dynamics import CONTROL_PERIOD
-from flytune.physics.rotors import spins, thrust
+from flytune.physics.rotors import places, spins, thrust
 from flytune.physics.vehicle import Vehicle
 from flytune.simulation.actuator import Actuator
 from flytune.simulation.aerodynamics import ground_effect, rotor_drag
-from flytune.simulation.model_files import motor_positions, urdf
+from flytune.simulation.model_files import urdf
 from flytune.simulation.simulator import VehicleStates, to_body, to_inertial
 
 BODY = -1  # PyBullet's index of a vehicle's base link
@@ -53,46 +52,42 @@ class PyBulletSimulator:
         self._vehicle, self._options = vehicle, options
         self._period = CONTROL_PERIOD / options.physics_steps
         self._actuator = Actuator(vehicle, number)
-        self._motors, self._spins = motor_positions(vehicle), np.array(spins(vehicle))
+        self._motors, self._spins = [[x, y, 0.0] for x, y in places(vehicle).tolist()], np.array(spins(vehicle))
         self._drag = np.array(vehicle.drag, float)
         self._client = self._bullet.connect(self._bullet.DIRECT)
         if self._client < 0:
             raise BadInput("pybullet: no client is left. Close a simulator that is no longer needed.")
         self._bullet.setGravity(0, 0, -float(vehicle.gravity), physicsClientId=self._client)
         self._bullet.setTimeStep(self._period, physicsClientId=self._client)
-        self._vehicles = self._load(number)
+        with tempfile.NamedTemporaryFile("w", suffix=".urdf", encoding="utf-8") as file:
+            file.write(urdf(vehicle))
+            file.flush()
+            self._vehicles = [self._load(file.name) for _ in range(number)]
 
-    def _load(self, number: int) -> list[int]:
-        """PyBullet's numbers of the vehicles."""
-        bullet, client = self._bullet, self._client
-        with tempfile.TemporaryDirectory() as folder:
-            file = Path(folder) / "vehicle.urdf"
-            file.write_text(urdf(self._vehicle), encoding="utf-8")
-            flags = bullet.URDF_USE_INERTIA_FROM_FILE  # else Bullet works one out from the collision shape
-            vehicles = [bullet.loadURDF(str(file), flags=flags, physicsClientId=client) for _ in range(number)]
-        for vehicle in vehicles:
-            bullet.changeDynamics(
-                vehicle,
-                BODY,
-                linearDamping=float(self._options.damping),
-                angularDamping=float(self._options.damping),
-                activationState=bullet.ACTIVATION_STATE_DISABLE_SLEEPING,
-                physicsClientId=client,
-            )
-        return vehicles
+    def _load(self, file: str) -> int:
+        """PyBullet's number of a new vehicle."""
+        bullet, damping = self._bullet, float(self._options.damping)
+        flags = bullet.URDF_USE_INERTIA_FROM_FILE  # else Bullet computes the inertia from the collision shape
+        vehicle = bullet.loadURDF(file, flags=flags, physicsClientId=self._client)
+        bullet.changeDynamics(
+            vehicle,
+            BODY,
+            linearDamping=damping,
+            angularDamping=damping,
+            activationState=bullet.ACTIVATION_STATE_DISABLE_SLEEPING,
+            physicsClientId=self._client,
+        )
+        return vehicle
 
     def place(self, states: VehicleStates, which: np.ndarray | None = None) -> None:
         """Put the vehicles there, see `Simulator`."""
         chosen = range(len(self._vehicles)) if which is None else which
         turning = to_inertial(np.asarray(states.attitude, float), np.asarray(states.body_rate, float))
-        for row, index in enumerate(chosen):
+        parts = (part.tolist() for part in (states.position, states.attitude, states.velocity, turning))
+        for index, position, attitude, velocity, rate in zip(chosen, *parts, strict=True):
             vehicle = self._vehicles[int(index)]
-            self._bullet.resetBasePositionAndOrientation(
-                vehicle, states.position[row].tolist(), states.attitude[row].tolist(), physicsClientId=self._client
-            )
-            self._bullet.resetBaseVelocity(
-                vehicle, states.velocity[row].tolist(), turning[row].tolist(), physicsClientId=self._client
-            )
+            self._bullet.resetBasePositionAndOrientation(vehicle, position, attitude, physicsClientId=self._client)
+            self._bullet.resetBaseVelocity(vehicle, velocity, rate, physicsClientId=self._client)
         self._actuator.place(states.rotor_speed_rpm, which)
 
     def advance(self, action: np.ndarray) -> None:

@@ -11,17 +11,9 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from flytune.config.pytree import label, pytree, static
+from flytune.control.policy import CONVENTIONS
 from flytune.errors import BadInput, require
-from flytune.export.untrusted.onnx_inspection import (
-    CONVENTIONS,
-    FORMAT,
-    INPUT,
-    OUTPUT,
-    VERSION,
-    first_line,
-    inspect,
-    metadata,
-)
+from flytune.export.untrusted.onnx_inspection import FORMAT, INPUT, OUTPUT, VERSION, first_line, inspect, metadata
 from flytune.task.observation import SIZE
 
 LARGEST = 100_000_000  # bytes; the network of the paper takes 25,000

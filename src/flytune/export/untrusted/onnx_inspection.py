@@ -10,14 +10,12 @@ from typing import Any
 
 import numpy as np
 
-from flytune.control.policy import ACTION
+from flytune.control.policy import CONVENTIONS
 from flytune.errors import BadInput, require
-from flytune.task.observation import LAYOUT, SIZE
+from flytune.task.observation import SIZE
 
 INPUT, OUTPUT = "observation", "action"
 FORMAT, VERSION = "format", "flytune_version"  # metadata entries that say which program wrote the file
-# A graph does not say what its numbers mean: a model without these entries in its metadata is refused.
-CONVENTIONS = {"observation": LAYOUT, "action": ACTION, "rate": "100 Hz"}
 # fmt: off
 OPERATORS = {
     "Abs", "Add", "And", "BatchNormalization", "Cast", "Ceil", "Celu", "Clip", "Concat", "Constant", "Cos", "Div",
@@ -142,6 +140,7 @@ def _refuse_other_conventions(model: Any, where: str) -> None:
     if not all(isinstance(text, str) for entry in model.metadata_props for text in (entry.key, entry.value)):
         raise BadInput(f"{where}: has damaged metadata (bytes that are not UTF-8). Export it again.")
     found = metadata(model)
+    # a graph does not say what its numbers mean: a model without these entries in its metadata is refused
     for key, wanted in CONVENTIONS.items():
         if found.get(key) != wanted:
             has = f"is {_shown(found[key])}" if key in found else "is missing"
