@@ -118,7 +118,7 @@ class HoverEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         return None if pictures is None else pictures[0]
 
     def close(self) -> None:
-        """Give the simulator's memory back."""
+        """Free the memory of the simulator."""
         self._environment.close()
 
     def _at(self, position: Any, yaw: float) -> Any:
@@ -219,7 +219,7 @@ class HoverVectorEnv(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarr
         return self._pictures.draw(self._environment, self._rewards)
 
     def close_extras(self, **kwargs: Any) -> None:
-        """Give the simulator's memory back."""
+        """Free the memory of the simulator."""
         self._environment.close()
 
     def _infos(self, moved: Transition, which: np.ndarray) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""What flytune's two Gymnasium environments share: task, spaces, checks of what a user gives, and pictures."""
+"""The parts that flytune's two Gymnasium environments share: task, spaces, checks of arguments, and pictures."""
 
 from collections import deque
 from pathlib import Path

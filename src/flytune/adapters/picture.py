@@ -17,8 +17,8 @@ from flytune.task.situation import POSITION_BAND, Target
 SIZE = 480  # pixels on each side
 FINER = 2  # drawn this much larger, then averaged down: smooth edges
 FIELD_OF_VIEW = math.radians(38)
-AZIMUTH, ELEVATION = math.radians(-142), math.radians(20)  # of the camera, seen from what it looks at
-NEAREST = 0.05  # m in front of the camera; what is nearer is left out
+AZIMUTH, ELEVATION = math.radians(-142), math.radians(20)  # of the camera, seen from the point that it looks at
+NEAREST = 0.05  # m in front of the camera; nearer things are left out
 SMALLEST_VEHICLE = 0.2  # of the picture's width, from rotor to rotor; a smaller one is drawn larger and says so
 
 SKY, HORIZON, GROUND = (26, 33, 50), (74, 90, 120), (24, 30, 43)
@@ -38,7 +38,7 @@ class Scene:
     target: Target
     state: VehicleStates  # of one vehicle, without a first axis
     trail: Float[np.ndarray, "steps 3"]  # m, where the vehicle has been, oldest first
-    lines: tuple[tuple[str, str], ...]  # what is written: name and value
+    lines: tuple[tuple[str, str], ...]  # of text: name and value
 
     @property
     def place(self) -> Float[np.ndarray, "3"]:
@@ -125,7 +125,7 @@ def _ground(pen: Any, camera: Camera, scene: Scene) -> None:
 
 
 def _shadow(pen: Any, camera: Camera, scene: Scene) -> None:
-    """Where vehicle and target stand over the ground, and how high."""
+    """The points on the ground below vehicle and target, and dashed lines up to them."""
     size = reach(scene.vehicle)
     shown = ((scene.state.position, (0, 0, 0), FRAME, 1.6 * size), (scene.place, TARGET, TARGET, size))
     for place, shadow, colour, radius in shown:

@@ -39,7 +39,7 @@ class HoverVecEnv(VecEnv):
         self.task = task
         self.environment = HostEnvironment(task, make_simulator(simulator, task.vehicle, number), number)
         self.environment.reset(seed)
-        self.render_mode: str | None = None  # the base class asks for it before it sets it
+        self.render_mode: str | None = None  # the base class reads it before it sets it
         self._names = causes(task.termination)
         self._own: list[dict[str, Any]] = [{} for _ in range(number)]
         self._action, self._started = np.zeros((number, 4), np.float32), time.monotonic()
@@ -86,7 +86,7 @@ class HoverVecEnv(VecEnv):
         return self.environment.observation, now.reward, ended, infos
 
     def close(self) -> None:
-        """Give the simulator's memory back."""
+        """Free the memory of the simulator."""
         self.environment.close()
 
     def get_attr(self, attr_name: str, indices: Indices = None) -> list[Any]:
@@ -95,7 +95,7 @@ class HoverVecEnv(VecEnv):
         return [self._own[i][attr_name] if attr_name in self._own[i] else getattr(self, attr_name) for i in which]
 
     def set_attr(self, attr_name: str, value: Any, indices: Indices = None) -> None:
-        """Keep a value with environments; what all of them share (the task, the spaces) cannot be set for one.
+        """Store a value for environments; attributes that all of them share (the task, the spaces) cannot be set.
 
         Raises:
             AttributeError: the environments share that attribute.

@@ -71,7 +71,7 @@ def unit_text(annotation: Any, before: str = "") -> str:
 
 
 def unwrap(annotation: Any) -> tuple[Any, list[Any]]:
-    """A type without its Annotated layers, and everything those layers said."""
+    """A type without its Annotated layers, and the contents of those layers."""
     details: list[Any] = []
     while get_origin(annotation) is Annotated:
         annotation, *more = get_args(annotation)
@@ -80,12 +80,12 @@ def unwrap(annotation: Any) -> tuple[Any, list[Any]]:
 
 
 def annotations(kind: Any) -> dict[str, Any]:
-    """The annotation of each field of a dataclass, with what stands inside `Annotated`."""
+    """The annotation of each field of a dataclass, with `Annotated`."""
     return get_type_hints(kind, include_extras=True)
 
 
 def step_into(annotation: Any, name: Any, data: Any) -> Any:
-    """The annotation one step further down a path, or None where the path leaves what is known."""
+    """The annotation one step further down a path, or None where there is no such field."""
     base, _ = unwrap(annotation)
     if is_union(base):
         base = variant_of(base, data)

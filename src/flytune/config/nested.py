@@ -20,7 +20,7 @@ def leaves(table: Mapping[str, Any], skip: Collection[str] = (), separator: str 
 
 
 def look_up(table: Mapping[str, Any], path: str) -> Any:
-    """What stands at a dotted path, a value or a table; None where there is nothing."""
+    """The value or table at a dotted path; None where there is none."""
     node: Any = table
     for key in path.split("."):
         node = node.get(key) if isinstance(node, Mapping) else None

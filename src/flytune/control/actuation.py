@@ -36,8 +36,8 @@ def torque_for(vehicle: Vehicle, angular_acceleration: Components, body_rate: Co
 def allocate(vehicle: Vehicle, thrust: Any, torque: Components) -> Components:
     """Four rotor speeds in rpm that give a thrust in N and a torque in N m, exactly where the rotors can.
 
-    Where a rotor would leave the range of the actions, yaw torque gives way first, then thrust, and roll and pitch
-    torque last, in their ratio: tilt decides whether the vehicle stays up, heading does not.
+    Where a rotor would leave the range of the actions, yaw torque is reduced first, then thrust is changed, and roll
+    and pitch torque are reduced last, in their ratio: a vehicle falls with a wrong tilt, not with a wrong heading.
 
     Source: the inverse of paper R4, worked out by hand; the order of priorities is the usual one of flight stacks
     (PX4 user guide, "airmode").
@@ -79,9 +79,9 @@ def _squares(vehicle: Vehicle, thrust: Any, torque: Components, limits: Componen
     """The squared rotor speeds of any layout in rpm^2, see `allocate`.
 
     The squares are q_i = s r_i + t_i f + c_i y: roll and pitch torque give r, of which the share s is kept, and t and c
-    are what thrust and yaw torque need of each rotor. All q_i have to lie within the limits. These conditions bound y
-    once s and f are known; that such a y exists bounds f once s is known; and that such an f exists bounds s
-    (Fourier-Motzkin elimination). So s, f and y are found in this order, each as near as possible to what is asked.
+    are the shares of thrust and yaw torque of each rotor. All q_i have to lie within the limits. These conditions bound
+    y once s and f are known; that such a y exists bounds f once s is known; and that such an f exists bounds s
+    (Fourier-Motzkin elimination). So s, f and y are found in this order, each as near as possible to its wanted value.
     """
     square = vehicle.hover_rotor_speed_rpm**2  # everything is in units in which hovering takes 1
     weight = vehicle.mass * vehicle.gravity
@@ -122,19 +122,19 @@ def action_for(
 ) -> Float[Array, "4"]:
     """The action in [-1, 1]^4 that brings the rotors from the speeds they have to those wanted, all in rpm.
 
-    A motor that lags is asked for more than is wanted, so that it closes the gap as fast as one with the shorter
-    time constant `motor_time_constant` in s would in the control period h:
+    The command of a motor that lags goes beyond the wanted speed, so that the motor closes the gap as fast as one with
+    the shorter time constant `motor_time_constant` in s would in the control period h:
 
         command = now + (wanted - now) (1 - exp(-h / motor_time_constant)) / (1 - exp(-h / tau))
 
-    A motor that is faster than that, or answers at once, is asked for what is wanted; without the constant, each is.
+    A motor that is faster than that gets the wanted speed as its command; without the constant, each motor does.
     """
     if motor_time_constant is not None:
-        hurried = 1 - jnp.exp(-CONTROL_PERIOD / motor_time_constant)
+        faster = 1 - jnp.exp(-CONTROL_PERIOD / motor_time_constant)
         rising = rotor_speed_after(vehicle, (0.0,), (1.0,), CONTROL_PERIOD)[0]
         falling = 1 - rotor_speed_after(vehicle, (1.0,), (0.0,), CONTROL_PERIOD)[0]
         wanted = tuple(
-            speed + (goal - speed) * jnp.maximum(hurried / jnp.where(goal > speed, rising, falling), 1.0)
+            speed + (goal - speed) * jnp.maximum(faster / jnp.where(goal > speed, rising, falling), 1.0)
             for speed, goal in zip(now, wanted, strict=True)
         )
     hover = vehicle.hover_rotor_speed_rpm

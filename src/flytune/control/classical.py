@@ -24,8 +24,8 @@ def classical_controller(name: str, task: Task, gains: str = "tuned") -> Control
 
     Args:
         name: `pid`, `geometric` or `lqr`.
-        task: what it will fly. Its bounds on speed, tilt and body rate become the controller's limits, less the margin
-            that the gains leave; a bound the task does not have limits nothing.
+        task: its bounds on speed, tilt and body rate, less a margin from the gains, become the controller's limits; a
+            bound that the task does not have limits nothing.
         gains: `tuned` or `textbook`.
 
     Raises:

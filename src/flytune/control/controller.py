@@ -1,4 +1,4 @@
-"""The protocol that every controller keeps, and what the classical controllers share: fields, and an outer loop."""
+"""The protocol of every controller, and the parts that the classical controllers share: fields and an outer loop."""
 
 from typing import Any, Protocol, runtime_checkable
 
@@ -14,10 +14,10 @@ from flytune.physics.vehicle import Vehicle
 
 @runtime_checkable
 class Controller(Protocol):
-    """A controller: a JAX pytree that turns observations into actions, and may remember something in between."""
+    """A controller: a JAX pytree that turns observations into actions, with a memory from one to the next."""
 
     def initial_memory(self) -> Any:
-        """What the controller knows before its first observation, a pytree; () for one that remembers nothing."""
+        """The memory before the first observation, a pytree; () for a controller without memory."""
         ...
 
     def act(self, memory: Any, observation: Float[Array, "17"]) -> tuple[Any, Float[Array, "4"]]:

@@ -25,7 +25,7 @@ Axes = tuple[Components, Components, Components]  # the columns of a rotation ma
 
 @pytree
 class GeometricGains:
-    """The paper's four gains, per unit of mass and of inertia, and what keeps them within bounds."""
+    """The paper's four gains, per unit of mass and of inertia, and limits."""
 
     position: Annotated[Real, Gt(0), Unit("1/s^2")]  # k_x / m
     velocity: Annotated[Real, Gt(0), Unit("1/s")]  # k_v / m
@@ -34,7 +34,7 @@ class GeometricGains:
     largest_yaw_error: Annotated[Real, Gt(0), Lt(1.57), Unit("rad")]  # fed to the law; a larger one is cut to it
     largest_tilt: Annotated[Real, Gt(0), Le(1), Unit("rad")]
     bound_share: Annotated[Real, Gt(0), Le(1), Unit("1")]  # of the task's bounds on speed, tilt and rate that is used
-    motor_time_constant: Annotated[Real, Gt(0), Unit("s")]  # what a slower motor is hurried to
+    motor_time_constant: Annotated[Real, Gt(0), Unit("s")]  # slower motors are driven as if they had this one
 
 
 @pytree
@@ -49,7 +49,7 @@ class Geometric(ClassicalController):
             f = F . R e3                                                 (eq. 15; F: the force of eq. 12, without minus)
             M = J (-k_R e_R - k_W e_W) + W x J W - J (W x R^T R_d W_d)   (eq. 16)
 
-        The derivative of W_d is left out: it asks for the jerk, which nothing here measures.
+        The derivative of W_d is left out: it needs the jerk, which is not measured.
         """
         sensed = sense(self.target_yaw, observation)
         rotors = estimated_rotor_speed(self.vehicle, memory, sensed.last_action)

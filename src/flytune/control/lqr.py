@@ -58,7 +58,7 @@ class Lqr(ClassicalController):
         """The action of one observation, see `Controller`.
 
         The linear law gives small changes of thrust, f_i = f_hover (1 + 2 action_scale u_i). The allocation turns
-        their sums into rotor speeds, because it also decides what gives way where a rotor is at its limit.
+        their sums into rotor speeds, because it also decides what is reduced where a rotor is at its limit.
         """
         sensed = sense(self.target_yaw, observation)
         rotors = estimated_rotor_speed(self.vehicle, memory, sensed.last_action)
@@ -83,7 +83,7 @@ class Lqr(ClassicalController):
         return *position, *velocity, 2 * tilted[0], 2 * tilted[1], yaw_error, *sensed.body_rate, *speeds
 
     def reachable(self, position_error: Components) -> Components:
-        """The position error in m, cut until neither the speed nor the tilt that it asks for exceeds its limit."""
+        """The position error in m, cut until neither the speed nor the tilt that it causes exceeds its limit."""
         pitch = directions(self.vehicle)[1]
         horizontal, vertical = self._ratio(pitch, 0, 3), self._ratio((1, 1, 1, 1), 2, 5)
         tilt_per_metre = jnp.abs(self._ratio(pitch, 0, 7))
@@ -91,7 +91,7 @@ class Lqr(ClassicalController):
         return *shortened(error[:2], self.tilt_limit / tilt_per_metre), error[2]
 
     def _ratio(self, motors: Components, state: int, to: int) -> Any:
-        """How one state weighs against another in what the motors do together."""
+        """The ratio of the gains of two states, in this combination of the motors."""
         row = jnp.asarray(motors, float) @ self.gain
         return row[state] / row[to]
 

@@ -28,7 +28,7 @@ class PidGains:
     vertical_velocity: PerSecond
     position_integral: Annotated[Real, Ge(0), Unit("1/s^3")]
     integral_zone: Annotated[Real, Ge(0), Unit("m")]  # the integral grows only this near to the target
-    integral_limit: Annotated[Real, Ge(0), Unit("m/s^2")]  # what the integral may add
+    integral_limit: Annotated[Real, Ge(0), Unit("m/s^2")]  # of the acceleration from the integral
     tilt: PerSecond
     yaw: PerSecond
     tilt_rate: PerSecond
@@ -36,7 +36,7 @@ class PidGains:
     largest_yaw_rate: Annotated[Real, Gt(0), Unit("rad/s")]
     largest_tilt: Annotated[Real, Gt(0), Le(1), Unit("rad")]
     bound_share: Annotated[Real, Gt(0), Le(1), Unit("1")]  # of the task's bounds on speed, tilt and rate that is used
-    motor_time_constant: Annotated[Real, Gt(0), Unit("s")]  # what a slower motor is hurried to
+    motor_time_constant: Annotated[Real, Gt(0), Unit("s")]  # slower motors are driven as if they had this one
 
 
 @pytree
@@ -105,7 +105,7 @@ class Pid(ClassicalController):
         tilt_rate = shortened((-g.tilt * ratio * y, g.tilt * ratio * x), self.body_rate_limit)
         yaw_error = wrapped(heading(sensed.attitude) - self.target_yaw)
         fastest = g.largest_yaw_rate
-        if self.body_rate_limit is not None:  # what tilting leaves of it
+        if self.body_rate_limit is not None:  # the rest of it beside tilting
             left_over = jnp.sqrt(jnp.maximum(self.body_rate_limit**2 - safe_norm(tilt_rate) ** 2, 0.0))
             fastest = jnp.minimum(fastest, left_over)
         yaw_rate = jnp.clip(-g.yaw * yaw_error, -fastest, fastest)

@@ -59,9 +59,9 @@ class Policy:
     """A learned controller: the deterministic action of its actor, squashed into [-1, 1]."""
 
     actor: Network
-    input_scale: Float[Array, "17"]  # what the observation is multiplied with before the actor sees it
+    input_scale: Float[Array, "17"]  # the observation times this is the input of the actor
     squash: Literal["clip", "tanh"] = static()  # PPO: the mean is clipped; analytic policy gradient: smooth
-    about: dict[str, Any] = label(default_factory=dict)  # task, vehicle, trainer: what the file's header says
+    about: dict[str, Any] = label(default_factory=dict)  # task, vehicle, trainer: in the header of the file
 
     def __call__(self, observation: Float[Array, "*batch 17"]) -> Float[Array, "*batch 4"]:
         """The action in [-1, 1] for one observation or a batch of them."""
@@ -84,7 +84,7 @@ class Policy:
 
 
 def save_policy(path: Path, policy: Policy) -> None:
-    """Write a policy as safetensors; its header carries the observation, the action and what `about` says, as JSON.
+    """Write a policy as safetensors; its header has the conventions and `about`, as JSON.
 
     Raises:
         BadInput: the file cannot be written.

@@ -97,12 +97,12 @@ ENDINGS: dict[str, Callable[..., Any]] = {
 class HostEnvironment:
     """N episodes of one task in one simulator, which step together.
 
-    `episodes`, `key` and `observation` are all that changes in flytune's own simulator: kept and put back, they let it
-    go on exactly as before.
+    In flytune's own simulator, only `episodes`, `key` and `observation` change: with these restored, it goes on exactly
+    as before.
 
     Args:
-        task: what is flown.
-        simulator: with N vehicles in it.
+        task: of the episodes.
+        simulator: of N vehicles.
         number: N.
         ending: what follows the end of an episode, one of `ENDINGS`.
     """
@@ -175,7 +175,7 @@ class HostEnvironment:
         return np.asarray(_steps(self._structure, self._numbers, self.episodes)).astype(int)
 
     def close(self) -> None:
-        """Give the simulator's memory back."""
+        """Free the memory of the simulator."""
         self.simulator.close()
 
 
@@ -255,7 +255,7 @@ def _step(
     def one(episode: Episode, action: Array, elsewhere: Any, key: Any) -> Any:
         if elsewhere is None:
             moved, outcome = environment.step(task, episode, action, physics)
-        else:  # what is on its way to the motors stays in the simulator
+        else:  # pending actions stay in the simulator
             state = state_from(elsewhere, episode.state.pending_actions)
             moved, outcome = environment.assess(task, episode, state, jnp.clip(action, -1.0, 1.0))
         return *ENDINGS[ending](task, episode, moved, outcome, key), moved, outcome

@@ -25,7 +25,7 @@ class JaxSimulatorOptions:
 
 
 class JaxSimulator:
-    """N vehicles under `physics.dynamics`, in float32."""
+    """N vehicles under `physics.dynamics`, in float32; see `Simulator`."""
 
     physics: Physics | None
 
@@ -37,23 +37,20 @@ class JaxSimulator:
         self._pending = np.zeros((vehicle.action_latency_steps, 4, number), np.float32)
 
     def place(self, states: VehicleStates, which: np.ndarray | None = None) -> None:
-        """Put the vehicles there, see `Simulator`."""
         chosen = slice(None) if which is None else which
         self._numbers, self._pending = np.array(self._numbers), np.array(self._pending)
         self._numbers[:, chosen] = states.rows().T
         self._pending[..., chosen] = 0.0
 
     def advance(self, action: np.ndarray) -> None:
-        """Let one control period pass, see `Simulator`."""
         given = np.asarray(action, np.float32).T
         self._numbers, self._pending = _advance(self._step, self._vehicle, self._numbers, self._pending, given)
 
     def states(self) -> VehicleStates:
-        """The states of the vehicles now, see `Simulator`."""
         return VehicleStates.from_rows(np.asarray(self._numbers, float).T)
 
     def close(self) -> None:
-        """Nothing to give back."""
+        """Nothing to free."""
 
 
 @lru_cache  # the same function for the same number, so that one compiled program serves every simulator

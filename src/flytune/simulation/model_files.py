@@ -10,13 +10,13 @@ from flytune.physics.vehicle import Vehicle
 
 Integrator = Literal["RK4", "Euler", "implicit", "implicitfast"]
 
-THICKNESS = 2e-3  # m, of what is drawn; it is neither weighed nor touched
+THICKNESS = 2e-3  # m, of the shapes that are drawn; they have neither mass nor contact
 
 
 def urdf(vehicle: Vehicle) -> str:
     """The vehicle as URDF: one link with mass and inertia, drawn with a disc at each motor.
 
-    It has no collision shapes, and URDF knows neither rotors nor drag: the forces are left to the caller.
+    It has no collision shapes, and URDF has neither rotors nor drag: the caller applies the forces.
     """
     ixx, iyy, izz = map(float, vehicle.inertia)
     side = reach(vehicle) / math.sqrt(2)
@@ -51,8 +51,8 @@ def urdf(vehicle: Vehicle) -> str:
 def mjcf(vehicle: Vehicle, *, timestep: float = CONTROL_PERIOD / 2, integrator: Integrator = "RK4") -> str:
     """The vehicle as MJCF: a free body, a site at each motor, and an actuator on it whose control is thrust in N.
 
-    A motor's torque about z comes with its thrust, km / kf times as large. Rotor lag and latency are left to the
-    caller, and so is drag, for which a free joint has one coefficient where a vehicle has three.
+    A motor's torque about z is km / kf times its thrust. The caller simulates rotor lag and latency, and sets the drag,
+    for which a free joint has one coefficient and a vehicle three.
     """
     ratio = float(vehicle.torque_coefficient / vehicle.thrust_coefficient)
     strongest = float(thrust(vehicle, vehicle.maximum_rotor_speed_rpm**2))

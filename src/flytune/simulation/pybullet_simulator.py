@@ -22,7 +22,7 @@ BODY = -1  # PyBullet's index of a vehicle's base link
 
 @pytree
 class PyBulletOptions:
-    """What is simulated beyond rigid bodies under thrust, and how finely."""
+    """The effects that are simulated beside rigid bodies under thrust, and the number of physics steps."""
 
     physics_steps: Annotated[Whole, Ge(1), Le(100), Unit("per control period")] = static(default=2)
     # slows a free body by damping * (1 + |v|) * v, and its rotation alike; Bullet's own default is 0.04
@@ -32,12 +32,11 @@ class PyBulletOptions:
 
 
 class PyBulletSimulator:
-    """N vehicles in one PyBullet client, without collisions, in float64.
+    """N vehicles in one PyBullet client, without collisions, in float64; see `Simulator`.
 
-    Bullet keeps the angular velocity in the inertial frame; it is turned into the body frame here. Its multibody
-    solver, which URDF files are loaded into, has the gyroscopic torque, advances velocities first and positions with
-    them (semi-implicit Euler, first order), and forgets forces after each step. docs/results/worlds.md has
-    measurements.
+    Bullet has the angular velocity in the inertial frame; it is turned into the body frame here. Its multibody solver,
+    which URDF files use, includes the gyroscopic torque, advances velocities first and positions with them
+    (semi-implicit Euler, first order), and clears forces after each step. docs/results/worlds.md has measurements.
     """
 
     physics = None
@@ -80,7 +79,6 @@ class PyBulletSimulator:
         return vehicle
 
     def place(self, states: VehicleStates, which: np.ndarray | None = None) -> None:
-        """Put the vehicles there, see `Simulator`."""
         chosen = range(len(self._vehicles)) if which is None else which
         turning = to_inertial(np.asarray(states.attitude, float), np.asarray(states.body_rate, float))
         parts = (part.tolist() for part in (states.position, states.attitude, states.velocity, turning))
@@ -91,14 +89,13 @@ class PyBulletSimulator:
         self._actuator.place(states.rotor_speed_rpm, which)
 
     def advance(self, action: np.ndarray) -> None:
-        """Let one control period pass, see `Simulator`."""
         self._actuator.command(action)
         for _ in range(self._options.physics_steps):
             self._push(self._actuator.turn(self._period))
             self._bullet.stepSimulation(physicsClientId=self._client)
 
     def _push(self, rotor_speed_rpm: np.ndarray) -> None:
-        """Apply the forces of a physics step: a thrust at each motor, their torque about z, and what the air does."""
+        """Apply the forces of a physics step: a thrust at each motor, their torque about z, drag and ground effect."""
         bullet, client, frame = self._bullet, self._client, self._bullet.LINK_FRAME
         squared = rotor_speed_rpm**2
         forces = thrust(self._vehicle, squared)
@@ -123,7 +120,6 @@ class PyBulletSimulator:
         return forces * (1 + ground_effect(self._vehicle, body.position, body.attitude))
 
     def states(self) -> VehicleStates:
-        """Where the vehicles are, see `Simulator`."""
         bullet, client = self._bullet, self._client
         places = [bullet.getBasePositionAndOrientation(vehicle, client) for vehicle in self._vehicles]
         motions = np.array([bullet.getBaseVelocity(vehicle, client) for vehicle in self._vehicles])

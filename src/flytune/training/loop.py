@@ -59,7 +59,7 @@ def train(
     sets this).
 
     Args:
-        task: what to learn; it holds the settings of the trainer.
+        task: also holds the settings of the trainer.
         trainer: the name of one of `TRAINERS`: `apg`, `ppo` or `sb3`.
         seed: of the weights, the episodes and the noise; 0 or more.
         out: run directory to write; nothing is written where None.

@@ -27,7 +27,7 @@ from flytune.task.task import Task
 from flytune.task.training_settings import PpoSettings
 from flytune.training.update import averaged, rollout_metrics
 
-LOSSES = {  # our names -> what Stable-Baselines3 logs
+LOSSES = {  # our names -> those in the log of Stable-Baselines3
     "loss": "train/loss",
     "policy_loss": "train/policy_gradient_loss",
     "value_loss": "train/value_loss",

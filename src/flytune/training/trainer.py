@@ -94,7 +94,7 @@ class Trainer:
         return self._algorithm().last_policy(self.settings(task), train_state)
 
     def warm_start(self, task: Task, train_state: Any, policy: Policy) -> Any:
-        """The training state before the first update, with an actor that flies as `policy` does.
+        """The training state before the first update, with an actor that gives the actions of `policy`.
 
         Raises:
             BadInput: see `check_warm_start`.
