@@ -63,7 +63,7 @@ def read_action(action: Any, shape: tuple[int, ...]) -> np.ndarray:
 
 
 def read_start(options: dict[str, Any] | None) -> dict[str, Any] | None:
-    """The start that the options of `reset` ask for, None where they ask for none.
+    """The start in the options of `reset`, None where they have none.
 
     Raises:
         BadInput: an unknown option or an impossible start.
@@ -85,7 +85,7 @@ def read_start(options: dict[str, Any] | None) -> dict[str, Any] | None:
 
 
 def read_mask(options: dict[str, Any] | None, number: int) -> np.ndarray | None:
-    """The environments that the options of a vector's `reset` name, None for all.
+    """The mask in the options of a vector environment's `reset`, None for all environments.
 
     Raises:
         BadInput: an unknown option, or a mask that is none.

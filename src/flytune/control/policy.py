@@ -110,9 +110,9 @@ def load_policy(path: Path) -> Policy:
         raise BadInput(f"{path}: no such file. Give a run directory or a .safetensors policy.") from None
     except (safetensors.SafetensorError, OSError, ValueError) as error:
         raise BadInput(f"{path}: is not a policy ({error}). Give a .safetensors file written by flytune.") from None
-    if not isinstance(header, dict) or header.get("format") != FORMAT:
-        found = header.get("format") if isinstance(header, dict) else None
-        raise BadInput(f"{path}: is not a flytune policy (format {found!r}). Allowed: {FORMAT}.")
+    header = header if isinstance(header, dict) else {}
+    if header.get("format") != FORMAT:
+        raise BadInput(f"{path}: is not a flytune policy (format {header.get('format')!r}). Allowed: {FORMAT}.")
     if not isinstance(header.get("about", {}), dict):
         raise BadInput(f"{path}: has a damaged header. Train it again.")
     if header.get("observation") != observation.LAYOUT:
