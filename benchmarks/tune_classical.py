@@ -63,7 +63,7 @@ def tune(name: str, trials: int, seed: int, tasks: list[Task]) -> tuple[dict[str
     """The best gains found, their cost, and the textbook's cost."""
     optuna = require("optuna", "optuna")
     optuna.logging.set_verbosity(optuna.logging.WARNING)
-    textbook = read_gains(name).textbook
+    textbook = read_gains(name)["textbook"]
     start = document.plain(textbook)
     free = {field: value for field, value in start.items() if field not in FIXED}
 

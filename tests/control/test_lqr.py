@@ -55,7 +55,7 @@ def test_the_linear_model_of_lagging_motors_remembers_them():
 @pytest.mark.parametrize("gains", SETS)
 def test_the_gain_solves_the_riccati_equation(vehicle, gains):
     # P is rebuilt from K alone, as the cost of flying it: P = (A - B K)' P (A - B K) + Q + K' R K
-    chosen = getattr(read_gains("lqr"), gains)
+    chosen = read_gains("lqr")[gains]
     (a, b), (q, r), k = linearised(vehicle), weights(chosen), feedback(vehicle, chosen)
     closed = a - b @ k
     p, term, step = np.zeros_like(a), q + k.T @ r @ k, closed
@@ -71,14 +71,14 @@ def test_the_gain_solves_the_riccati_equation(vehicle, gains):
 
 @pytest.mark.parametrize("gains", SETS)
 def test_the_closed_loop_is_stable(vehicle, gains):
-    chosen = getattr(read_gains("lqr"), gains)
+    chosen = read_gains("lqr")[gains]
     a, b = linearised(vehicle)
     assert np.abs(np.linalg.eigvals(a)).max() > 0.999  # on its own it is not
     assert np.abs(np.linalg.eigvals(a - b @ feedback(vehicle, chosen))).max() < 0.999
 
 
 def test_weights_are_bryson_s(vehicle):
-    gains = read_gains("lqr").textbook
+    gains = read_gains("lqr")["textbook"]
     q, r = weights(gains)
     np.testing.assert_allclose(q[2, 2], 1 / gains.vertical_error**2)
     np.testing.assert_allclose(q[11, 11], 1 / gains.yaw_rate**2)

@@ -10,15 +10,15 @@ import pytest
 
 from flytune.config.pytree import pytree
 from flytune.control.classical import classical_controller, controller_with, read_gains
+from flytune.control.controller import slowed, specific_force
 from flytune.control.sensing import sense
-from flytune.control.steering import slowed, specific_force
 
 
 @pytest.fixture(scope="module")
 def gains():
     """Round numbers."""
     return dataclasses.replace(
-        read_gains("pid").textbook,
+        read_gains("pid")["textbook"],
         horizontal_position=2.0,
         vertical_position=1.0,
         horizontal_velocity=5.0,

@@ -22,7 +22,7 @@ onnx = pytest.importorskip("onnx", reason="needs flytune[onnx]")
 onnxruntime = pytest.importorskip("onnxruntime", reason="needs flytune[onnx]")
 
 from flytune.export.onnx import CONVENTIONS, OnnxController, check_actions, load_onnx, rounding_bound, save_onnx  # noqa: E402
-from flytune.export.untrusted.onnx_session import sample_observations  # noqa: E402
+from flytune.export.untrusted.onnx_controller import sample_observations  # noqa: E402
 
 
 def make_policy(hidden=(64, 64), squash="tanh", gain=0.5, about=None, seed=0):

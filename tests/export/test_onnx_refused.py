@@ -18,8 +18,7 @@ pytest.importorskip("onnxruntime", reason="needs flytune[onnx]")
 from onnx import TensorProto, helper, numpy_helper  # noqa: E402
 
 from flytune.export.onnx import CONVENTIONS, OnnxController, load_onnx  # noqa: E402
-from flytune.export.untrusted.onnx_controller import read_onnx  # noqa: E402
-from flytune.export.untrusted.onnx_session import sample_observations  # noqa: E402
+from flytune.export.untrusted.onnx_controller import read_onnx, sample_observations  # noqa: E402
 
 RANDOM = np.random.default_rng(7)
 FIRST = 0.1 * RANDOM.standard_normal((8, 17)).astype(np.float32)

@@ -1,9 +1,8 @@
-"""flytune/Hover-v0 for Gymnasium 1.x: one environment, and (`vector`) many of them over the batched core.
+"""flytune/Hover-v0 for Gymnasium 1.x: one vehicle, and a vector environment of many over the batched core.
 
 Out-of-range actions are clipped, as in the paper (R9). Misuse raises Gymnasium's own errors.
 """
 
-from collections import deque
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -12,21 +11,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from flytune.adapters import registration
-from flytune.adapters.hover import (
-    METADATA,
-    TRAIL,
-    make_spaces,
-    read_action,
-    read_render_mode,
-    read_start,
-    read_task,
-    take_picture,
-)
-from flytune.adapters.vector import HoverVectorEnv
-from flytune.errors import require
+from flytune.adapters.hover import METADATA, Pictures, make_spaces, read_action, read_mask, read_start, read_task
+from flytune.errors import BadInput, require
 from flytune.physics.dynamics import hovering
 from flytune.physics.rotation import from_euler
-from flytune.simulation.host import HostEnvironment, draw_episodes, episodes_at
+from flytune.simulation.host import HostEnvironment, Transition, draw_episodes, episodes_at
 from flytune.simulation.simulator import state_numbers
 from flytune.simulation.simulators import make_simulator
 from flytune.task.observation import NOISY
@@ -35,10 +24,10 @@ from flytune.task.termination import causes
 
 if TYPE_CHECKING:
     import gymnasium
+    from gymnasium.vector import AutoresetMode
 else:
     gymnasium = require("gymnasium", "gymnasium")  # a missing one in one line
-
-__all__ = ["HoverEnv", "HoverVectorEnv"]
+    AutoresetMode = gymnasium.vector.AutoresetMode
 
 registration.register()
 
@@ -72,24 +61,22 @@ class HoverEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         render_mode: str | None = None,
     ) -> None:
         self.task = read_task(task, edits)
-        self.render_mode = read_render_mode(render_mode)
+        self.render_mode = render_mode
+        self._pictures = Pictures(render_mode)
         self.observation_space, self.action_space = make_spaces()
-        flown_in = make_simulator(simulator, self.task.vehicle, 1, simulator_options)
-        self._environment = HostEnvironment(self.task, flown_in, 1, ending="none")
+        used = make_simulator(simulator, self.task.vehicle, 1, simulator_options)
+        self._environment = HostEnvironment(self.task, used, 1, ending="none")
         self._causes = causes(self.task.termination)
-        self._trail: deque[np.ndarray] = deque(maxlen=TRAIL)
-        self._steps, self._reward = 0, 0.0
-        self._state = "made"  # then "flying", then "ended"
+        self._reward = np.zeros(1)
+        self._missing_reset: str | None = "before the first reset"  # why `step` has to be refused
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, dict[str, Any]]:
-        """The observation at a new start, and an empty info.
+        """The observation at a new start, and an empty info; a seed makes everything that follows reproducible.
 
-        Args:
-            seed: makes everything that follows reproducible.
-            options: `position` [x, y, z] in metres and `yaw` in radians (0 where left out) start there, level and at
-                rest, instead of at a start drawn from the task's.
+        The options `position` [x, y, z] in metres and `yaw` in radians (0 where left out) replace the start drawn from
+        the task's by this one, level and at rest.
 
         Raises:
             BadInput: an unknown option or an impossible start.
@@ -98,9 +85,8 @@ class HoverEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         start, seed = read_start(options), int(self.np_random.integers(2**32))
         episodes = draw_episodes(self.task, jax.random.key(seed)[None]) if start is None else self._at(**start)
         observation = self._environment.start(episodes, self._noise())[0]
-        self._steps, self._reward, self._state = 0, 0.0, "flying"
-        self._trail.clear()
-        self._trail.append(self._environment.states[0, :3])
+        self._reward, self._missing_reset = np.zeros(1), None
+        self._pictures.follow(self._environment)
         return observation, {}
 
     def step(self, action: Any) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
@@ -110,18 +96,17 @@ class HoverEnv(gymnasium.Env[np.ndarray, np.ndarray]):
             ResetNeeded: before the first reset, or after the end of an episode.
             InvalidAction: not four finite numbers.
         """
-        if self._state != "flying":
-            when = "after the end of an episode" if self._state == "ended" else "before the first reset"
-            raise gymnasium.error.ResetNeeded(f"step() was called {when}. Call reset() first.")
+        if self._missing_reset:
+            raise gymnasium.error.ResetNeeded(f"step() was called {self._missing_reset}. Call reset() first.")
         moved = self._environment.step(read_action(action, (4,))[None], self._noise())
         terminated, truncated = bool(moved.terminated[0]), bool(moved.truncated[0])
-        self._steps, self._reward = self._steps + 1, float(moved.reward[0])
-        self._trail.append(self._environment.states[0, :3])
+        self._reward = moved.reward
+        self._pictures.follow(self._environment)
         if terminated or truncated:
-            self._state = "ended"
+            self._missing_reset = "after the end of an episode"
         terms = {name: float(reward[0]) for name, reward in moved.terms.items()}
         info = {"reward_terms": terms, "termination": self._causes[moved.cause[0]] if terminated else None}
-        return self._environment.observation[0], self._reward, terminated, truncated, info
+        return self._environment.observation[0], float(self._reward[0]), terminated, truncated, info
 
     def render(self) -> np.ndarray | None:  # pyright: ignore[reportIncompatibleMethodOverride]
         """A picture [480, 480, 3] of the present state, or None without a render mode.
@@ -129,15 +114,11 @@ class HoverEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         Raises:
             ResetNeeded: before the first reset.
         """
-        if self.render_mode is None:
-            gymnasium.logger.warn('render() needs render_mode="rgb_array", given to gymnasium.make.')
-            return None
-        if self._state == "made":
-            raise gymnasium.error.ResetNeeded("render() was called before the first reset. Call reset() first.")
-        return take_picture(self.task, self._environment.states[0], np.array(self._trail), self._steps, self._reward)
+        pictures = self._pictures.draw(self._environment, self._reward)
+        return None if pictures is None else pictures[0]
 
     def close(self) -> None:
-        """Give the simulator's memory back."""
+        """Free the memory of the simulator."""
         self._environment.close()
 
     def _at(self, position: Any, yaw: float) -> Any:
@@ -148,3 +129,109 @@ class HoverEnv(gymnasium.Env[np.ndarray, np.ndarray]):
 
     def _noise(self) -> np.ndarray:
         return self.np_random.standard_normal((NOISY, 1), dtype=np.float32)
+
+
+class HoverVectorEnv(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
+    """Many vehicles that are to hover, stepped by one compiled call.
+
+    An environment that ends starts anew in the same step (`AutoresetMode.SAME_STEP`): the observation is then the new
+    episode's, and `final_obs` and `final_info` of the infos hold the last ones of the old episode.
+
+    There are `num_envs` of them; the other arguments and their errors are those of `HoverEnv`.
+    """
+
+    metadata = METADATA | {"autoreset_mode": AutoresetMode.SAME_STEP}
+
+    def __init__(
+        self,
+        num_envs: int = 1,
+        task: str | Path | Task = "baseline",
+        edits: dict[str, Any] | None = None,
+        simulator: str = "flytune",
+        simulator_options: dict[str, Any] | None = None,
+        render_mode: str | None = None,
+    ) -> None:
+        if num_envs < 1:
+            raise BadInput(f"num_envs: {num_envs} is not allowed. Allowed: a whole number, 1 or more.")
+        self.task = read_task(task, edits)
+        self.render_mode = render_mode
+        self._pictures = Pictures(render_mode)
+        self.num_envs = num_envs
+        self.single_observation_space, self.single_action_space = make_spaces()
+        self.observation_space = gymnasium.vector.utils.batch_space(self.single_observation_space, num_envs)
+        self.action_space = gymnasium.vector.utils.batch_space(self.single_action_space, num_envs)
+        used = make_simulator(simulator, self.task.vehicle, num_envs, simulator_options)
+        self._environment = HostEnvironment(self.task, used, num_envs)
+        self._names = np.array([*causes(self.task.termination), None], dtype=object)  # the last, -1, is SAFE
+        self._rewards = np.zeros(num_envs)
+        self._begun = False
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[np.ndarray, dict[str, Any]]:
+        """The observations at new starts, and an empty info; a seed makes everything that follows reproducible.
+
+        The option `reset_mask` is a boolean array of the environments to reset; all are reset where it is left out.
+
+        Raises:
+            BadInput: an unknown option, or a mask that is none.
+            ResetNeeded: a mask before the first reset.
+        """
+        super().reset(seed=seed)
+        mask = read_mask(options, self.num_envs)
+        if not self._begun and mask is not None:
+            raise gymnasium.error.ResetNeeded("reset() with a mask was called before the first full reset.")
+        goes_on = self._begun and seed is None  # with the random numbers of the environment
+        observation = self._environment.reset(None if goes_on else int(self.np_random.integers(2**32)), mask)
+        self._begun = True
+        self._rewards = np.where(True if mask is None else mask, 0.0, self._rewards)
+        self._pictures.follow(self._environment)
+        return observation, {}
+
+    def step(self, actions: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
+        """The observations, rewards, terminations, truncations and infos of one control period (0.01 s).
+
+        Raises:
+            ResetNeeded: before the first reset.
+            InvalidAction: not four finite numbers for each environment.
+        """
+        if not self._begun:
+            raise gymnasium.error.ResetNeeded("step() was called before the first reset. Call reset() first.")
+        moved = self._environment.step(read_action(actions, (self.num_envs, 4)))
+        reward, ended = moved.reward, moved.ended
+        self._rewards = np.where(ended, 0.0, reward)
+        self._pictures.follow(self._environment)
+        infos = self._infos(moved, ~ended)
+        if ended.any():
+            final, last = np.full(self.num_envs, None, dtype=object), moved.final_observation
+            for index in np.flatnonzero(ended):
+                final[index] = last[index]
+            infos |= {"final_obs": final, "_final_obs": ended}
+            infos |= {"final_info": self._infos(moved, ended), "_final_info": ended.copy()}
+        return self._environment.observation, reward, moved.terminated, moved.truncated, infos
+
+    def render(self) -> tuple[np.ndarray, ...] | None:
+        """A picture [480, 480, 3] of each environment, or None without a render mode.
+
+        Raises:
+            ResetNeeded: before the first reset.
+        """
+        return self._pictures.draw(self._environment, self._rewards)
+
+    def close_extras(self, **kwargs: Any) -> None:
+        """Free the memory of the simulator."""
+        self._environment.close()
+
+    def _infos(self, moved: Transition, which: np.ndarray) -> dict[str, Any]:
+        """The infos of the environments in a mask, in the form of Gymnasium: arrays, each with its mask `_name`."""
+        if not which.any():
+            return {}
+        terms: dict[str, Any] = {}
+        for name, reward in moved.terms.items():
+            terms |= {name: np.where(which, reward, 0.0), f"_{name}": which.copy()}
+        return {
+            "reward_terms": terms,
+            "_reward_terms": which.copy(),
+            "termination": self._names[np.where(which, moved.cause, -1)],
+            "_termination": which.copy(),
+        }

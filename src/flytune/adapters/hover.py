@@ -1,5 +1,6 @@
-"""What flytune's two Gymnasium environments share: task, spaces, the judgement of what a user gives, the picture."""
+"""The parts that flytune's two Gymnasium environments share: task, spaces, checks of arguments, and pictures."""
 
+from collections import deque
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -7,10 +8,9 @@ import numpy as np
 
 from flytune.errors import BadInput, require
 from flytune.physics.dynamics import CONTROL_PERIOD
-from flytune.physics.rotors import places
+from flytune.simulation.host import HostEnvironment
 from flytune.simulation.simulator import VehicleStates
 from flytune.task.observation import SIZE
-from flytune.task.situation import POSITION_BAND
 from flytune.task.task import Task, load_task
 
 if TYPE_CHECKING:
@@ -18,8 +18,7 @@ if TYPE_CHECKING:
 else:
     gymnasium = require("gymnasium", "gymnasium")  # a missing one in one line
 
-RENDER_MODES = ("rgb_array",)
-METADATA = {"render_modes": list(RENDER_MODES), "render_fps": round(1 / CONTROL_PERIOD)}
+METADATA = {"render_modes": ["rgb_array"], "render_fps": round(1 / CONTROL_PERIOD)}
 TRAIL = 300  # steps of the way behind a vehicle that a picture shows
 FARTHEST = 1000.0  # m, also rad: of a start given by hand
 
@@ -39,25 +38,9 @@ def read_task(task: str | Path | Task, edits: dict[str, Any] | None) -> Task:
     return task
 
 
-def read_render_mode(mode: str | None) -> str | None:
-    """The render mode itself.
-
-    Raises:
-        BadInput: an unknown one, or Pillow is not installed.
-    """
-    if mode is not None and mode not in RENDER_MODES:
-        raise BadInput(f"render_mode: {mode!r} is not allowed. Allowed: None, {', '.join(RENDER_MODES)}.")
-    if mode is not None:
-        require("PIL.Image", "gymnasium")
-    return mode
-
-
 def make_spaces() -> tuple[gymnasium.spaces.Box, gymnasium.spaces.Box]:
-    """The spaces of one observation and one action.
-
-    An observation may be any finite number; infinite bounds would say the same, but `check_env` warns of them.
-    """
-    largest = float(np.finfo(np.float32).max)
+    """The spaces of one observation and one action."""
+    largest = float(np.finfo(np.float32).max)  # infinite bounds would mean the same, but `check_env` warns of them
     observation = gymnasium.spaces.Box(-largest, largest, (SIZE,), np.float32)
     return observation, gymnasium.spaces.Box(-1.0, 1.0, (4,), np.float32)
 
@@ -80,7 +63,7 @@ def read_action(action: Any, shape: tuple[int, ...]) -> np.ndarray:
 
 
 def read_start(options: dict[str, Any] | None) -> dict[str, Any] | None:
-    """The start that the options of `reset` ask for, None where they ask for none.
+    """The start in the options of `reset`, None where they have none.
 
     Raises:
         BadInput: an unknown option or an impossible start.
@@ -102,7 +85,7 @@ def read_start(options: dict[str, Any] | None) -> dict[str, Any] | None:
 
 
 def read_mask(options: dict[str, Any] | None, number: int) -> np.ndarray | None:
-    """The environments that the options of a vector's `reset` name, None for all.
+    """The mask in the options of a vector environment's `reset`, None for all environments.
 
     Raises:
         BadInput: an unknown option, or a mask that is none.
@@ -125,28 +108,56 @@ def _refuse_unknown(options: dict[str, Any], known: tuple[str, ...]) -> None:
             raise BadInput(f"options.{name}: is unknown. Allowed: {', '.join(known)}.")
 
 
-def take_picture(task: Task, body: np.ndarray, trail: np.ndarray, steps: int, reward: float) -> np.ndarray:
-    """The picture of a body's 17 numbers, with the way it came."""
+class Pictures:
+    """The pictures of the vehicles of an environment, with the way they came; nothing is kept without a render mode.
+
+    Raises:
+        BadInput: an unknown render mode, or Pillow is not installed.
+    """
+
+    def __init__(self, render_mode: str | None) -> None:
+        if render_mode not in (None, "rgb_array"):
+            raise BadInput(f"render_mode: {render_mode!r} is not allowed. Allowed: None, rgb_array.")
+        if render_mode is not None:
+            require("PIL.Image", "gymnasium")
+        self._wanted = render_mode is not None
+        self._trail: deque[np.ndarray] = deque(maxlen=TRAIL)
+
+    def follow(self, environment: HostEnvironment) -> None:
+        """Remember where the vehicles are."""
+        if self._wanted:
+            self._trail.append(environment.states[:, :3])
+
+    def draw(self, environment: HostEnvironment, rewards: np.ndarray) -> tuple[np.ndarray, ...] | None:
+        """A picture of each vehicle, with the rewards [N] of its last step; None without a render mode.
+
+        Raises:
+            ResetNeeded: before the first reset.
+        """
+        if not self._wanted:
+            gymnasium.logger.warn('render() needs render_mode="rgb_array", given when the environment is made.')
+            return None
+        if not self._trail:
+            raise gymnasium.error.ResetNeeded("render() was called before the first reset. Call reset() first.")
+        trail = np.array(self._trail)
+        return tuple(
+            _picture(environment.task, state, trail[-(steps + 1) :, index], int(steps), float(reward))
+            for index, (state, steps, reward) in enumerate(
+                zip(environment.states, environment.steps(), rewards, strict=True)
+            )
+        )
+
+
+def _picture(task: Task, numbers: np.ndarray, trail: np.ndarray, steps: int, reward: float) -> np.ndarray:
     from flytune.adapters import picture  # here, because it needs Pillow
 
-    now = VehicleStates.from_rows(np.nan_to_num(body).astype(float))
-    target = np.array(task.target.position, float)
-    distance, speed = np.linalg.norm(body[:3] - target), np.linalg.norm(now.velocity)
-    scene = picture.Scene(
-        position=now.position,
-        attitude=now.attitude,
-        thrust=(now.rotor_speed_rpm / task.vehicle.hover_rotor_speed_rpm) ** 2,
-        rotors=places(task.vehicle),
-        propeller_radius=float(task.vehicle.propeller_radius),
-        target=target,
-        target_yaw=float(task.target.yaw),
-        band=POSITION_BAND,
-        trail=np.nan_to_num(trail).astype(float),
-        lines=(
-            ("time", f"{steps * CONTROL_PERIOD:.2f} s"),
-            ("distance", f"{distance:.3f} m"),
-            ("speed", f"{speed:.2f} m/s"),
-            ("reward", f"{reward:.3f}"),
-        ),
+    state = VehicleStates.from_rows(np.nan_to_num(numbers).astype(float))
+    distance = np.linalg.norm(numbers[:3] - np.array(task.target.position, float))
+    lines = (
+        ("time", f"{steps * CONTROL_PERIOD:.2f} s"),
+        ("distance", f"{distance:.3f} m"),
+        ("speed", f"{np.linalg.norm(state.velocity):.2f} m/s"),
+        ("reward", f"{reward:.3f}"),
     )
-    return picture.draw(scene)
+    way = np.nan_to_num(trail).astype(float)
+    return picture.draw(picture.Scene(vehicle=task.vehicle, target=task.target, state=state, trail=way, lines=lines))

@@ -30,23 +30,16 @@ class HoverVecEnv(VecEnv):
 
     The info of a step is empty until an episode ends; it then holds `terminal_observation`, `TimeLimit.truncated`,
     `episode` with its return `r`, length `l` and time `t` in s as Stable-Baselines3's Monitor gives them, and `cause`,
-    the termination condition that was broken or "horizon". What every environment's last step brought, the reward of
-    each term among it, is in `transition`.
-
-    Args:
-        task: what is flown.
-        number: how many environments.
-        seed: of initial states and noise, until `seed` and `reset` are called.
-        simulator: "flytune", "pybullet" or "mujoco".
+    the termination condition that was broken or "horizon". The seed holds until `seed` and `reset` are called.
     """
 
-    transition: Transition | None = None
+    transition: Transition | None = None  # of the last step, with the reward of each term
 
     def __init__(self, task: Task, number: int, seed: int = 0, simulator: str = "flytune") -> None:
         self.task = task
         self.environment = HostEnvironment(task, make_simulator(simulator, task.vehicle, number), number)
         self.environment.reset(seed)
-        self.render_mode: str | None = None  # the base class asks for it before it sets it
+        self.render_mode: str | None = None  # the base class reads it before it sets it
         self._names = causes(task.termination)
         self._own: list[dict[str, Any]] = [{} for _ in range(number)]
         self._action, self._started = np.zeros((number, 4), np.float32), time.monotonic()
@@ -93,16 +86,16 @@ class HoverVecEnv(VecEnv):
         return self.environment.observation, now.reward, ended, infos
 
     def close(self) -> None:
-        """Give the simulator's memory back."""
+        """Free the memory of the simulator."""
         self.environment.close()
 
     def get_attr(self, attr_name: str, indices: Indices = None) -> list[Any]:
-        """An attribute of each environment: what `set_attr` gave it, else that of the whole."""
+        """An attribute of each environment: the value from `set_attr`, else the shared one."""
         which = self._get_indices(indices)
         return [self._own[i][attr_name] if attr_name in self._own[i] else getattr(self, attr_name) for i in which]
 
     def set_attr(self, attr_name: str, value: Any, indices: Indices = None) -> None:
-        """Keep a value with environments; what all of them share (the task, the spaces) cannot be set for one.
+        """Store a value for environments; attributes that all of them share (the task, the spaces) cannot be set.
 
         Raises:
             AttributeError: the environments share that attribute.

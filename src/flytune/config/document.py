@@ -1,6 +1,6 @@
-"""Reading: TOML to nested tables to dataclasses, with one clear line for whatever cannot be read.
+"""Reading: TOML to nested tables to dataclasses, with one line for what cannot be read.
 
-`plain` and `write` (config/writing.py) are the way back, and belong to the same interface.
+`plain` and `write` of config/writing.py do the reverse, and belong to the same interface.
 """
 
 import dataclasses
@@ -64,23 +64,20 @@ def parse(text: str, where: str) -> dict[str, Any]:
 
 
 def read(kind: type[T], data: Mapping[str, Any], where: str = "") -> T:
-    """A `kind` made from plain data, every value checked.
-
-    Args:
-        kind: a dataclass made with `pytree`.
-        data: nested tables as TOML gives them.
-        where: what to name in front of an error, for instance the file.
+    """A dataclass made with `pytree` from nested tables, every value checked.
 
     Raises:
-        BadInput: an unknown or missing key, a wrong type, a value out of range; one line that names the field path.
+        BadInput: an unknown or missing key, a wrong type, a value out of range; one line that names `where`, for
+            instance the file, and the field path.
     """
+    prefix = f"{where}: " if where else ""
     try:
         result = TypeAdapter(kind).validate_python(data)
     except ValidationError as error:
-        raise BadInput(_prefix(where) + _explain(kind, data, error)) from None
+        raise BadInput(prefix + _explain(kind, data, error)) from None
     for path, node in _nodes(result):
         if problem := getattr(node, "problem", lambda: None)():
-            raise BadInput(f"{_prefix(where)}{'.'.join((*path, problem))}")
+            raise BadInput(prefix + ".".join((*path, problem)))
     return result
 
 
@@ -99,10 +96,6 @@ def parse_assignment(text: str) -> tuple[str, Any]:
         return path.strip(), value.strip()
 
 
-def _prefix(where: str) -> str:
-    return f"{where}: " if where else ""
-
-
 def _nodes(node: Any, path: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], Any]]:
     if dataclasses.is_dataclass(node):
         yield path, node
@@ -115,21 +108,18 @@ def _nodes(node: Any, path: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, .
 
 def _explain(kind: Any, data: Any, error: ValidationError) -> str:
     """One line for the first thing that is wrong, unknown keys before what they may have been meant for."""
-    problems = sorted(error.errors(), key=lambda problem: problem["type"] != "unexpected_keyword_argument")
-    problem = problems[0]
-    annotation, path = kind, []
-    node: Any = data
-    last = problem["loc"][-1] if problem["loc"] else None
+    problem = min(error.errors(), key=lambda problem: problem["type"] != "unexpected_keyword_argument")
     place: tuple[Any, ...] = problem["loc"]
+    node: Any = data
+    annotation, path = kind, []
     for index, name in enumerate(place):
-        final = index == len(problem["loc"]) - 1
-        is_key = isinstance(node, Mapping) and name in node
-        is_index = isinstance(node, list | tuple) and isinstance(name, int) and name < len(node)
-        missing = final and problem["type"] in ("missing", "unexpected_keyword_argument")
-        if not (is_key or is_index or missing):
-            continue  # the tag of a union, which is no part of the path
+        final = index == len(place) - 1
         if final and problem["type"] == "unexpected_keyword_argument":
             return _unknown_key(annotation, node, path, str(name))
+        is_key = isinstance(node, Mapping) and name in node
+        is_index = isinstance(node, list | tuple) and isinstance(name, int) and name < len(node)
+        if not (is_key or is_index or (final and problem["type"] == "missing")):
+            continue  # the tag of a union, which is no part of the path
         annotation = step_into(annotation, name, node)
         node = node[name] if is_key or is_index else None
         path.append(str(name))
@@ -139,9 +129,9 @@ def _explain(kind: Any, data: Any, error: ValidationError) -> str:
         named = node.get("kind") if isinstance(node, Mapping) else None
         hint = nearest(str(named), known)
         return f"{where}.kind: {named!r} is none of: {', '.join(known)}." + (f" Did you mean {hint}?" if hint else "")
-    if problem["type"] == "missing" and not isinstance(last, int):
-        return f"{where}: missing. Allowed: {allowed(annotation)}{unit_text(annotation, ' ')}."
-    return f"{where}: {_shown(node)} is not allowed. Allowed: {allowed(annotation)}{unit_text(annotation, ' ')}."
+    is_missing = problem["type"] == "missing" and not isinstance(place[-1], int)
+    found = "missing" if is_missing else f"{_shown(node)} is not allowed"
+    return f"{where}: {found}. Allowed: {allowed(annotation)}{unit_text(annotation, ' ')}."
 
 
 def _unknown_key(annotation: Any, node: Any, path: list[str], name: str) -> str:

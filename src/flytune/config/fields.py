@@ -1,8 +1,4 @@
-"""What the annotation of a dataclass's field says of it, in words for people.
-
-An annotation holds type, unit and range (`Annotated[Real, Ge(0), Unit("m/s")]`). The reader, the writer and the error
-messages all take them from there, so no second list is needed.
-"""
+"""Type, unit and range of a dataclass's field from its annotation, `Annotated[Real, Ge(0), Unit("m/s")]`, in words."""
 
 import dataclasses
 import difflib
@@ -16,9 +12,6 @@ from pydantic import AllowInfNan, Strict
 Real = Annotated[float, Strict(), AllowInfNan(False)]
 Whole = Annotated[int, Strict()]
 Vector = tuple[Real, Real, Real]
-
-_LOWER = {annotated_types.Ge: "ge", annotated_types.Gt: "gt"}
-_UPPER = {annotated_types.Le: "le", annotated_types.Lt: "lt"}
 
 
 def allowed(annotation: Any) -> str:
@@ -35,20 +28,20 @@ def allowed(annotation: Any) -> str:
         items = [item for item in get_args(base) if item is not Ellipsis]
         length = f"{len(items)} values" if len(items) == len(get_args(base)) else "a list"
         return f"{length}, each {allowed(items[0])}"
-    lower = [(getattr(d, _LOWER[type(d)]), type(d)) for d in details if type(d) in _LOWER]
-    upper = [(getattr(d, _UPPER[type(d)]), type(d)) for d in details if type(d) in _UPPER]
-    number = "a whole number" if base is int else ""
-    if lower and upper:
-        above = "above " if lower[0][1] is annotated_types.Gt else ""
-        below = "below " if upper[0][1] is annotated_types.Lt else ""
-        text = f"{above}{lower[0][0]} to {below}{upper[0][0]}"
-    elif lower:
-        text = f"above {lower[0][0]}" if lower[0][1] is annotated_types.Gt else f"{lower[0][0]} or more"
-    elif upper:
-        text = f"below {upper[0][0]}" if upper[0][1] is annotated_types.Lt else f"{upper[0][0]} or less"
-    else:
-        text = {float: "a finite number", int: "", str: "text", bool: "true or false"}.get(base, str(base))
-    return ", ".join(part for part in (number, text) if part)
+    lower = upper = alone = ""  # alone: the words for a bound without one on the other side
+    for detail in details:
+        match detail:
+            case annotated_types.Gt(gt=bound):
+                lower = alone = f"above {bound}"
+            case annotated_types.Ge(ge=bound):
+                lower, alone = f"{bound}", f"{bound} or more"
+            case annotated_types.Lt(lt=bound):
+                upper = alone = f"below {bound}"
+            case annotated_types.Le(le=bound):
+                upper, alone = f"{bound}", f"{bound} or less"
+    other = {float: "a finite number", int: "", str: "text", bool: "true or false"}.get(base, str(base))
+    text = f"{lower} to {upper}" if lower and upper else alone or other
+    return ", ".join(filter(None, ("a whole number" if base is int else "", text)))
 
 
 def unit_of(kind: Any, data: Mapping[str, Any], path: str) -> str:
@@ -78,7 +71,7 @@ def unit_text(annotation: Any, before: str = "") -> str:
 
 
 def unwrap(annotation: Any) -> tuple[Any, list[Any]]:
-    """A type without its Annotated layers, and everything those layers said."""
+    """A type without its Annotated layers, and the contents of those layers."""
     details: list[Any] = []
     while get_origin(annotation) is Annotated:
         annotation, *more = get_args(annotation)
@@ -87,12 +80,12 @@ def unwrap(annotation: Any) -> tuple[Any, list[Any]]:
 
 
 def annotations(kind: Any) -> dict[str, Any]:
-    """The annotation of each field of a dataclass, with what stands inside `Annotated`."""
+    """The annotation of each field of a dataclass, with `Annotated`."""
     return get_type_hints(kind, include_extras=True)
 
 
 def step_into(annotation: Any, name: Any, data: Any) -> Any:
-    """The annotation one step further down a path, or None where the path leaves what is known."""
+    """The annotation one step further down a path, or None where there is no such field."""
     base, _ = unwrap(annotation)
     if is_union(base):
         base = variant_of(base, data)

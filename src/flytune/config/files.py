@@ -12,13 +12,9 @@ from flytune.errors import BadInput
 def write_bytes(path: Path, content: bytes, field: str = "out") -> None:
     """Write a file, whole or not at all: a temporary file beside it takes its place once it is complete.
 
-    Args:
-        path: the file; its folder has to exist, and a file that is there is replaced.
-        content: what the file will hold.
-        field: the option or argument that gave the path, named in an error.
-
     Raises:
-        BadInput: the file cannot be written; nothing of it is left, and an earlier file is untouched.
+        BadInput: the file cannot be written; nothing of it is left, and an earlier file is untouched. The message
+            names `field`, the option or argument that gave the path.
     """
     temporary = path.with_name(f"{path.name}.{os.getpid()}.part")
     try:

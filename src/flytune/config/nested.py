@@ -9,13 +9,7 @@ LABELS = ("name", "sources")  # for people: two tasks that differ in nothing els
 
 
 def leaves(table: Mapping[str, Any], skip: Collection[str] = (), separator: str = ".") -> Iterator[tuple[str, Any]]:
-    """Path and value of everything that is no table, in the order of the tables.
-
-    Args:
-        table: nested tables.
-        skip: keys that are left out at every depth, with what is below them.
-        separator: what joins the keys of a path.
-    """
+    """Path and value of everything that is no table; keys in `skip` are left out at every depth."""
     for key, value in table.items():
         if key in skip:
             continue
@@ -26,7 +20,7 @@ def leaves(table: Mapping[str, Any], skip: Collection[str] = (), separator: str 
 
 
 def look_up(table: Mapping[str, Any], path: str) -> Any:
-    """What stands at a dotted path, a value or a table; None where there is nothing."""
+    """The value or table at a dotted path; None where there is none."""
     node: Any = table
     for key in path.split("."):
         node = node.get(key) if isinstance(node, Mapping) else None

@@ -1,4 +1,4 @@
-"""Frozen dataclasses that JAX can look into: numbers are leaves, structure is static, labels are left out."""
+"""Frozen dataclasses that are JAX pytrees: numbers are leaves, structure is static, labels are left out."""
 
 import dataclasses
 from typing import Any, TypeVar, dataclass_transform

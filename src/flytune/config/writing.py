@@ -11,22 +11,18 @@ from flytune.config.fields import allowed, annotations, unit_text
 
 def plain(node: Any) -> dict[str, Any]:
     """The nested tables a dataclass is written as, the inverse of `read`; empty optional fields are left out."""
-    result = {}
-    for field in dataclasses.fields(node):
-        value = getattr(node, field.name)
-        if value is None or (field.metadata.get("label") and value in ({}, "")):
-            continue
-        result[field.name] = _plain_value(value)
-    return result
+    values = ((field, getattr(node, field.name)) for field in dataclasses.fields(node))
+    return {
+        field.name: _plain_value(value)
+        for field, value in values
+        if value is not None and not (field.metadata.get("label") and value in ({}, ""))
+    }
 
 
 def write(node: Any, sources: Mapping[str, str] | None = None, heading: str = "") -> str:
     """The TOML text of a dataclass: exact values, each with its unit, allowed range and source as a comment.
 
-    Args:
-        node: a dataclass made with `pytree`.
-        sources: field path, or the start of one -> where its value comes from.
-        heading: lines to stand on top, as comments.
+    `sources` maps field paths, or the tables above them, to the source; the heading becomes comments at the top.
     """
     document = tomlkit.document()
     for line in heading.splitlines():
@@ -37,11 +33,9 @@ def write(node: Any, sources: Mapping[str, str] | None = None, heading: str = ""
 
 def source_of(path: str, sources: Mapping[str, str]) -> str:
     """The source of a field: its own entry, or that of the nearest table above it; empty where there is none."""
-    parts = path.split(".")
-    for length in range(len(parts), 0, -1):
-        if found := sources.get(".".join(parts[:length])):
-            return found
-    return ""
+    while path and not sources.get(path):
+        path = path.rpartition(".")[0]
+    return sources.get(path, "")
 
 
 def _plain_value(value: Any) -> Any:
@@ -63,10 +57,11 @@ def _fill(table: Any, node: Any, path: tuple[str, ...], sources: Mapping[str, st
             later.append((name, original, value))
             continue
         item = tomlkit.item(value)
-        notes = [unit_text(hints[name]) or ("1" if _is_number(value) else ""), allowed(hints[name])]
-        notes.append(source_of(".".join((*path, name)), sources))
         if name not in ("kind", "name"):
-            item.comment("; ".join(note for note in notes if note))
+            is_number = isinstance(value, int | float | list) and not isinstance(value, bool)
+            unit = unit_text(hints[name]) or ("1" if is_number else "")
+            notes = (unit, allowed(hints[name]), source_of(".".join((*path, name)), sources))
+            item.comment("; ".join(filter(None, notes)))
         table.add(name, item)
     for name, original, value in later:
         inner = tomlkit.table()
@@ -82,7 +77,3 @@ def _fill(table: Any, node: Any, path: tuple[str, ...], sources: Mapping[str, st
             for key, item in value.items():
                 inner.add(key, item)
         table.add(name, inner)
-
-
-def _is_number(value: Any) -> bool:
-    return isinstance(value, int | float | list) and not isinstance(value, bool)

@@ -5,14 +5,14 @@ from typing import Any
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from flytune.physics.components import Components, pack
+from flytune.physics.components import Components, add, cross, pack
 from flytune.physics.dynamics import CONTROL_PERIOD, commanded_rotor_speed, rotor_speed_after
 from flytune.physics.rotors import directions
 from flytune.physics.vehicle import Vehicle
 
 
 def hovering_rotors(vehicle: Vehicle) -> Components:
-    """Four rotors at hover speed, in rpm: what a controller believes before its first observation."""
+    """Four rotors at hover speed, in rpm: the estimate before the first observation."""
     return tuple(jnp.full(4, vehicle.hover_rotor_speed_rpm, float))
 
 
@@ -26,11 +26,18 @@ def estimated_rotor_speed(vehicle: Vehicle, before: Components, last_action: Com
     return rotor_speed_after(vehicle, before, commanded, CONTROL_PERIOD)
 
 
+def torque_for(vehicle: Vehicle, angular_acceleration: Components, body_rate: Components) -> Components:
+    """The torque in N m that gives an angular acceleration in rad/s^2: J a + W x J W (Euler's equation)."""
+    momentum = tuple(i * w for i, w in zip(vehicle.inertia, body_rate, strict=True))
+    turning = tuple(i * a for i, a in zip(vehicle.inertia, angular_acceleration, strict=True))
+    return add(turning, cross(body_rate, momentum))
+
+
 def allocate(vehicle: Vehicle, thrust: Any, torque: Components) -> Components:
     """Four rotor speeds in rpm that give a thrust in N and a torque in N m, exactly where the rotors can.
 
-    Where a rotor would leave the range of the actions, yaw torque gives way first, then thrust, and roll and pitch
-    torque last, in their ratio: tilt decides whether the vehicle stays up, heading does not.
+    Where a rotor would leave the range of the actions, yaw torque is reduced first, then thrust is changed, and roll
+    and pitch torque are reduced last, in their ratio: a vehicle falls with a wrong tilt, not with a wrong heading.
 
     Source: the inverse of paper R4, worked out by hand; the order of priorities is the usual one of flight stacks
     (PX4 user guide, "airmode").
@@ -72,9 +79,9 @@ def _squares(vehicle: Vehicle, thrust: Any, torque: Components, limits: Componen
     """The squared rotor speeds of any layout in rpm^2, see `allocate`.
 
     The squares are q_i = s r_i + t_i f + c_i y: roll and pitch torque give r, of which the share s is kept, and t and c
-    are what thrust and yaw torque need of each rotor. All q_i have to lie within the limits. These conditions bound y
-    once s and f are known; that such a y exists bounds f once s is known; and that such an f exists bounds s
-    (Fourier-Motzkin elimination). So s, f and y are found in this order, each as near as possible to what is asked.
+    are the shares of thrust and yaw torque of each rotor. All q_i have to lie within the limits. These conditions bound
+    y once s and f are known; that such a y exists bounds f once s is known; and that such an f exists bounds s
+    (Fourier-Motzkin elimination). So s, f and y are found in this order, each as near as possible to its wanted value.
     """
     square = vehicle.hover_rotor_speed_rpm**2  # everything is in units in which hovering takes 1
     weight = vehicle.mass * vehicle.gravity
@@ -115,25 +122,19 @@ def action_for(
 ) -> Float[Array, "4"]:
     """The action in [-1, 1]^4 that brings the rotors from the speeds they have to those wanted, all in rpm.
 
-    A motor that lags is asked for more than is wanted, so that it closes the gap as fast as one with the shorter
-    time constant `motor_time_constant` would in the control period h:
+    The command of a motor that lags goes beyond the wanted speed, so that the motor closes the gap as fast as one with
+    the shorter time constant `motor_time_constant` in s would in the control period h:
 
         command = now + (wanted - now) (1 - exp(-h / motor_time_constant)) / (1 - exp(-h / tau))
 
-    A motor that is faster than that, or answers at once, is asked for what is wanted.
-
-    Args:
-        vehicle: whose rotors.
-        now: rotor speeds as estimated.
-        wanted: rotor speeds.
-        motor_time_constant: s; None asks for what is wanted.
+    A motor that is faster than that gets the wanted speed as its command; without the constant, each motor does.
     """
     if motor_time_constant is not None:
-        hurried = 1 - jnp.exp(-CONTROL_PERIOD / motor_time_constant)
+        faster = 1 - jnp.exp(-CONTROL_PERIOD / motor_time_constant)
         rising = rotor_speed_after(vehicle, (0.0,), (1.0,), CONTROL_PERIOD)[0]
         falling = 1 - rotor_speed_after(vehicle, (1.0,), (0.0,), CONTROL_PERIOD)[0]
         wanted = tuple(
-            speed + (goal - speed) * jnp.maximum(hurried / jnp.where(goal > speed, rising, falling), 1.0)
+            speed + (goal - speed) * jnp.maximum(faster / jnp.where(goal > speed, rising, falling), 1.0)
             for speed, goal in zip(now, wanted, strict=True)
         )
     hover = vehicle.hover_rotor_speed_rpm

@@ -13,20 +13,19 @@ from jaxtyping import Array, Float
 
 from flytune.config.document import Real
 from flytune.config.pytree import pytree
-from flytune.control.actuation import action_for, allocate, estimated_rotor_speed, hovering_rotors
+from flytune.control.actuation import action_for, allocate, estimated_rotor_speed, torque_for
+from flytune.control.controller import ClassicalController, slowed, specific_force
 from flytune.control.sensing import Sensed, body_axes, dot, heading, sense, wrapped
-from flytune.control.steering import slowed, specific_force
 from flytune.physics.components import Components, add, cross, scale
 from flytune.physics.rotation import safe_norm
 from flytune.physics.rotors import thrust_and_torque
-from flytune.physics.vehicle import Vehicle
 
 Axes = tuple[Components, Components, Components]  # the columns of a rotation matrix
 
 
 @pytree
 class GeometricGains:
-    """The paper's four gains, per unit of mass and of inertia, and what keeps them within bounds."""
+    """The paper's four gains, per unit of mass and of inertia, and limits."""
 
     position: Annotated[Real, Gt(0), Unit("1/s^2")]  # k_x / m
     velocity: Annotated[Real, Gt(0), Unit("1/s")]  # k_v / m
@@ -35,23 +34,14 @@ class GeometricGains:
     largest_yaw_error: Annotated[Real, Gt(0), Lt(1.57), Unit("rad")]  # fed to the law; a larger one is cut to it
     largest_tilt: Annotated[Real, Gt(0), Le(1), Unit("rad")]
     bound_share: Annotated[Real, Gt(0), Le(1), Unit("1")]  # of the task's bounds on speed, tilt and rate that is used
-    motor_time_constant: Annotated[Real, Gt(0), Unit("s")]  # what a slower motor is hurried to
+    motor_time_constant: Annotated[Real, Gt(0), Unit("s")]  # slower motors are driven as if they had this one
 
 
 @pytree
-class Geometric:
-    """The law, for one vehicle and one target heading; it remembers the rotor speeds it believes in."""
+class Geometric(ClassicalController):
+    """The law of the paper."""
 
     gains: GeometricGains
-    vehicle: Vehicle
-    target_yaw: Any  # rad
-    speed_limit: Any  # m/s, or None
-    tilt_limit: Any  # rad
-    body_rate_limit: Any  # rad/s, or None
-
-    def initial_memory(self) -> Components:
-        """Rotors at hover speed, in rpm."""
-        return hovering_rotors(self.vehicle)
 
     def act(self, memory: Components, observation: Float[Array, "17"]) -> tuple[Components, Float[Array, "4"]]:
         """The action of one observation, see `Controller`.
@@ -59,7 +49,7 @@ class Geometric:
             f = F . R e3                                                 (eq. 15; F: the force of eq. 12, without minus)
             M = J (-k_R e_R - k_W e_W) + W x J W - J (W x R^T R_d W_d)   (eq. 16)
 
-        The derivative of W_d is left out: it asks for the jerk, which nothing here measures.
+        The derivative of W_d is left out: it needs the jerk, which is not measured.
         """
         sensed = sense(self.target_yaw, observation)
         rotors = estimated_rotor_speed(self.vehicle, memory, sensed.last_action)
@@ -76,18 +66,14 @@ class Geometric:
             wanted_axes, (sensed.position_error, sensed.velocity), (sensed.velocity, acceleration_now)
         )
         reference = turned_by(axes, turn_of(wanted, turning), wanted)
-        inertia, rate = self.vehicle.inertia, sensed.body_rate
-        attitude_error = attitude_error_vector(axes, wanted)
-        rate_error = tuple(w - r for w, r in zip(rate, reference, strict=True))
+        rate_error = tuple(w - r for w, r in zip(sensed.body_rate, reference, strict=True))
         turn = add(
-            scale(-self.gains.attitude, attitude_error),
+            scale(-self.gains.attitude, attitude_error_vector(axes, wanted)),
             scale(-self.gains.body_rate, rate_error),
-            scale(-1, cross(rate, reference)),
+            scale(-1, cross(sensed.body_rate, reference)),
         )
-        momentum = tuple(i * w for i, w in zip(inertia, rate, strict=True))
-        torque = add(tuple(i * a for i, a in zip(inertia, turn, strict=True)), cross(rate, momentum))
         thrust = self.vehicle.mass * dot(self.force(sensed.position_error, sensed.velocity), axes[2])
-        speeds = allocate(self.vehicle, thrust, torque)
+        speeds = allocate(self.vehicle, thrust, torque_for(self.vehicle, turn, sensed.body_rate))
         return rotors, action_for(self.vehicle, rotors, speeds, self.gains.motor_time_constant)
 
     def force(self, position_error: Components, velocity: Components) -> Components:

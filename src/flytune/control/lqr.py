@@ -11,20 +11,18 @@ from scipy.linalg import solve_discrete_are
 
 from flytune.config.document import Real
 from flytune.config.pytree import pytree
-from flytune.control.actuation import action_for, allocate, estimated_rotor_speed, hovering_rotors
+from flytune.control.actuation import action_for, allocate, estimated_rotor_speed
+from flytune.control.controller import ClassicalController, shortened, slowed
 from flytune.control.sensing import Sensed, heading, sense, wrapped
-from flytune.control.steering import shortened, slowed
 from flytune.errors import BadInput
 from flytune.physics import dynamics, rotation
 from flytune.physics.components import Components, pack, unpack
 from flytune.physics.rotors import directions, mixed
 from flytune.physics.vehicle import Vehicle
 
+# The state: position error (3) in m and velocity (3) in m/s, in axes that turn with the heading; roll, pitch and yaw
+# error in rad; body rate (3) in rad/s; rotor speed (4) in units of the action.
 STATES = 16
-STATE = (
-    "position error (3) [m] and velocity (3) [m/s] in axes that turn with the heading, "
-    "roll, pitch and yaw error [rad], body rate (3) [rad/s], rotor speed (4) in units of the action"
-)
 Metres = Annotated[Real, Gt(0), Unit("m")]
 Speed = Annotated[Real, Gt(0), Unit("m/s")]
 Radians = Annotated[Real, Gt(0), Unit("rad")]
@@ -50,26 +48,17 @@ class LqrGains:
 
 
 @pytree
-class Lqr:
-    """The feedback u = -K x, for one vehicle and one target heading; it remembers the rotor speeds it believes in."""
+class Lqr(ClassicalController):
+    """The feedback u = -K x."""
 
     gain: Float[Array, "4 16"]  # K: action per unit of each state
     gains: LqrGains
-    vehicle: Vehicle
-    target_yaw: Any  # rad
-    speed_limit: Any  # m/s, or None
-    tilt_limit: Any  # rad
-    body_rate_limit: Any  # rad/s, or None
-
-    def initial_memory(self) -> Components:
-        """Rotors at hover speed, in rpm."""
-        return hovering_rotors(self.vehicle)
 
     def act(self, memory: Components, observation: Float[Array, "17"]) -> tuple[Components, Float[Array, "4"]]:
         """The action of one observation, see `Controller`.
 
-        The linear law gives small changes of thrust, f_i = f_hover (1 + 2 action_scale u_i). The rotor speeds for these
-        come from the exact mixer, which also decides what gives way where a rotor is at its limit.
+        The linear law gives small changes of thrust, f_i = f_hover (1 + 2 action_scale u_i). The allocation turns
+        their sums into rotor speeds, because it also decides what is reduced where a rotor is at its limit.
         """
         sensed = sense(self.target_yaw, observation)
         rotors = estimated_rotor_speed(self.vehicle, memory, sensed.last_action)
@@ -80,7 +69,7 @@ class Lqr:
         return rotors, action_for(self.vehicle, rotors, allocate(self.vehicle, thrust, torque))
 
     def deviation(self, sensed: Sensed, rotors: Components) -> Components:
-        """The 16 states that are fed back, see `STATE`, with position and yaw errors cut to what the limits allow."""
+        """The state that is fed back, with position and yaw errors cut to what the limits allow."""
         yaw = heading(sensed.attitude)
         tilted = rotation.multiply(rotation.from_euler(jnp.zeros(()), jnp.zeros(()), -yaw), sensed.attitude)
         position = self.reachable(_turned(sensed.position_error, yaw))
@@ -94,7 +83,7 @@ class Lqr:
         return *position, *velocity, 2 * tilted[0], 2 * tilted[1], yaw_error, *sensed.body_rate, *speeds
 
     def reachable(self, position_error: Components) -> Components:
-        """The position error in m, cut until neither the speed nor the tilt that it asks for exceeds its limit."""
+        """The position error in m, cut until neither the speed nor the tilt that it causes exceeds its limit."""
         pitch = directions(self.vehicle)[1]
         horizontal, vertical = self._ratio(pitch, 0, 3), self._ratio((1, 1, 1, 1), 2, 5)
         tilt_per_metre = jnp.abs(self._ratio(pitch, 0, 7))
@@ -102,23 +91,9 @@ class Lqr:
         return *shortened(error[:2], self.tilt_limit / tilt_per_metre), error[2]
 
     def _ratio(self, motors: Components, state: int, to: int) -> Any:
-        """How one state weighs against another in what the motors do together."""
+        """The ratio of the gains of two states, in this combination of the motors."""
         row = jnp.asarray(motors, float) @ self.gain
         return row[state] / row[to]
-
-
-def make_lqr(vehicle: Vehicle, gains: LqrGains, **limits: Any) -> Lqr:
-    """The regulator of a vehicle.
-
-    Args:
-        vehicle: what is flown.
-        gains: largest acceptable deviations.
-        limits: `target_yaw`, `speed_limit`, `tilt_limit`, `body_rate_limit`, see `Lqr`.
-
-    Raises:
-        BadInput: no stabilising feedback could be worked out.
-    """
-    return Lqr(gain=jnp.asarray(feedback(vehicle, gains), jnp.float32), gains=gains, vehicle=vehicle, **limits)
 
 
 def feedback(vehicle: Vehicle, gains: LqrGains) -> Float[np.ndarray, "4 16"]:
@@ -150,7 +125,7 @@ def weights(gains: LqrGains) -> tuple[np.ndarray, np.ndarray]:
 
 
 def linearised(vehicle: Vehicle) -> tuple[np.ndarray, np.ndarray]:
-    """A [16, 16] and B [16, 4] of one control period about hover, see `STATE`: the derivative of the very step flown.
+    """A [16, 16] and B [16, 4] of one control period about hover: the derivative of the simulated step.
 
     The motors' lag and the drag are in it. An action latency is not.
     """

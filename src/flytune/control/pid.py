@@ -1,6 +1,6 @@
-"""A cascaded PID: position, velocity, attitude, body rate, mixer; each loop tells the next one what to want."""
+"""A cascaded PID: position, velocity, attitude, body rate, mixer; each loop gives the next one its reference."""
 
-from typing import Annotated, Any
+from typing import Annotated
 
 import jax.numpy as jnp
 from annotated_types import Ge, Gt, Le, Unit
@@ -8,13 +8,12 @@ from jaxtyping import Array, Float
 
 from flytune.config.document import Real
 from flytune.config.pytree import pytree
-from flytune.control.actuation import action_for, allocate, estimated_rotor_speed, hovering_rotors
+from flytune.control.actuation import action_for, allocate, estimated_rotor_speed, torque_for
+from flytune.control.controller import ClassicalController, shortened, slowed, specific_force
 from flytune.control.sensing import Sensed, body_axes, dot, heading, sense, wrapped
-from flytune.control.steering import shortened, slowed, specific_force
-from flytune.physics.components import Components, add, cross, scale
+from flytune.physics.components import Components, add, scale
 from flytune.physics.dynamics import CONTROL_PERIOD
 from flytune.physics.rotation import safe_norm
-from flytune.physics.vehicle import Vehicle
 
 PerSecond = Annotated[Real, Gt(0), Unit("1/s")]
 
@@ -29,7 +28,7 @@ class PidGains:
     vertical_velocity: PerSecond
     position_integral: Annotated[Real, Ge(0), Unit("1/s^3")]
     integral_zone: Annotated[Real, Ge(0), Unit("m")]  # the integral grows only this near to the target
-    integral_limit: Annotated[Real, Ge(0), Unit("m/s^2")]  # what the integral may add
+    integral_limit: Annotated[Real, Ge(0), Unit("m/s^2")]  # of the acceleration from the integral
     tilt: PerSecond
     yaw: PerSecond
     tilt_rate: PerSecond
@@ -37,7 +36,7 @@ class PidGains:
     largest_yaw_rate: Annotated[Real, Gt(0), Unit("rad/s")]
     largest_tilt: Annotated[Real, Gt(0), Le(1), Unit("rad")]
     bound_share: Annotated[Real, Gt(0), Le(1), Unit("1")]  # of the task's bounds on speed, tilt and rate that is used
-    motor_time_constant: Annotated[Real, Gt(0), Unit("s")]  # what a slower motor is hurried to
+    motor_time_constant: Annotated[Real, Gt(0), Unit("s")]  # slower motors are driven as if they had this one
 
 
 @pytree
@@ -49,19 +48,14 @@ class PidMemory:
 
 
 @pytree
-class Pid:
-    """The cascade, for one vehicle and one target heading."""
+class Pid(ClassicalController):
+    """The cascade."""
 
     gains: PidGains
-    vehicle: Vehicle
-    target_yaw: Any  # rad
-    speed_limit: Any  # m/s, or None
-    tilt_limit: Any  # rad
-    body_rate_limit: Any  # rad/s, or None
 
     def initial_memory(self) -> PidMemory:
         """Nothing summed up, rotors at hover speed."""
-        return PidMemory(integral=tuple(jnp.zeros(3)), rotor_speed_rpm=hovering_rotors(self.vehicle))
+        return PidMemory(integral=tuple(jnp.zeros(3)), rotor_speed_rpm=super().initial_memory())
 
     def act(self, memory: PidMemory, observation: Float[Array, "17"]) -> tuple[PidMemory, Float[Array, "4"]]:
         """The action of one observation, see `Controller`."""
@@ -70,11 +64,8 @@ class Pid:
         acceleration, integral = self.acceleration(sensed, memory.integral)
         force = specific_force(self.vehicle, acceleration, self.tilt_limit)
         turn = self.angular_acceleration(sensed, force)
-        inertia = self.vehicle.inertia
-        gyroscopic = cross(sensed.body_rate, tuple(i * w for i, w in zip(inertia, sensed.body_rate, strict=True)))
-        torque = add(tuple(i * a for i, a in zip(inertia, turn, strict=True)), gyroscopic)
         thrust = self.vehicle.mass * dot(force, body_axes(sensed.attitude)[2])
-        wanted = allocate(self.vehicle, thrust, torque)
+        wanted = allocate(self.vehicle, thrust, torque_for(self.vehicle, turn, sensed.body_rate))
         action = action_for(self.vehicle, rotors, wanted, self.gains.motor_time_constant)
         return PidMemory(integral=integral, rotor_speed_rpm=rotors), action
 
@@ -114,7 +105,7 @@ class Pid:
         tilt_rate = shortened((-g.tilt * ratio * y, g.tilt * ratio * x), self.body_rate_limit)
         yaw_error = wrapped(heading(sensed.attitude) - self.target_yaw)
         fastest = g.largest_yaw_rate
-        if self.body_rate_limit is not None:  # what tilting leaves of it
+        if self.body_rate_limit is not None:  # the rest of it beside tilting
             left_over = jnp.sqrt(jnp.maximum(self.body_rate_limit**2 - safe_norm(tilt_rate) ** 2, 0.0))
             fastest = jnp.minimum(fastest, left_over)
         yaw_rate = jnp.clip(-g.yaw * yaw_error, -fastest, fastest)

@@ -1,4 +1,4 @@
-"""The networks: an actor that flies and a critic that predicts reward, both 17-64-64 with tanh (paper R16)."""
+"""Learned controllers: the network, the policy around it, and its file."""
 
 import itertools
 import json
@@ -24,6 +24,7 @@ ACTION = (
     "4 motors [-1, 1]: rotor speed = hover speed * (1 + action_scale * action); "
     "0 (+x, -y), 1 (-x, -y), 2 (-x, +y), 3 (+x, +y)"
 )
+CONVENTIONS = {"observation": observation.LAYOUT, "action": ACTION, "rate": "100 Hz"}  # in every policy's file
 
 
 @pytree
@@ -46,27 +47,21 @@ def make_network(key: jax.Array, sizes: Sequence[int], last_gain: float) -> Netw
     Source: the initialisation of Stable-Baselines3's actor-critic (paper R17).
     """
     gains = [2**0.5] * (len(sizes) - 2) + [last_gain]
-    keys = jax.random.split(key, len(gains))
-    shapes = list(itertools.pairwise(sizes))
+    layers = zip(gains, jax.random.split(key, len(gains)), itertools.pairwise(sizes), strict=True)
     return Network(
-        weights=tuple(
-            jax.nn.initializers.orthogonal(gain)(k, shape) for k, gain, shape in zip(keys, gains, shapes, strict=True)
-        ),
+        weights=tuple(jax.nn.initializers.orthogonal(gain)(k, shape) for gain, k, shape in layers),
         biases=tuple(jnp.zeros(size) for size in sizes[1:]),
     )
 
 
 @pytree
 class Policy:
-    """A learned controller: the deterministic action of its actor, squashed into [-1, 1].
-
-    `clip` cuts a Gaussian policy's mean (PPO); `tanh` squashes smoothly (analytic policy gradient).
-    """
+    """A learned controller: the deterministic action of its actor, squashed into [-1, 1]."""
 
     actor: Network
-    input_scale: Float[Array, "17"]  # what the observation is multiplied with before the actor sees it
-    squash: Literal["clip", "tanh"] = static()
-    about: dict[str, Any] = label(default_factory=dict)  # task, vehicle, trainer: what the file's header says
+    input_scale: Float[Array, "17"]  # the observation times this is the input of the actor
+    squash: Literal["clip", "tanh"] = static()  # PPO: the mean is clipped; analytic policy gradient: smooth
+    about: dict[str, Any] = label(default_factory=dict)  # task, vehicle, trainer: in the header of the file
 
     def __call__(self, observation: Float[Array, "*batch 17"]) -> Float[Array, "*batch 4"]:
         """The action in [-1, 1] for one observation or a batch of them."""
@@ -75,9 +70,8 @@ class Policy:
 
     def __repr__(self) -> str:
         sizes = "-".join(map(str, [*(len(weight) for weight in self.actor.weights), len(self.actor.biases[-1])]))
-        made_for = (
-            f", {self.about['task']} on {self.about['vehicle']}" if {"task", "vehicle"} <= set(self.about) else ""
-        )
+        known = {"task", "vehicle"} <= self.about.keys()
+        made_for = f", {self.about['task']} on {self.about['vehicle']}" if known else ""
         return f"Policy({sizes}, {self.squash}{made_for})"
 
     def initial_memory(self) -> tuple[()]:
@@ -90,23 +84,15 @@ class Policy:
 
 
 def save_policy(path: Path, policy: Policy) -> None:
-    """Write a policy as safetensors; its header carries the observation, the action and what `about` says, as JSON.
+    """Write a policy as safetensors; its header has the conventions and `about`, as JSON.
 
     Raises:
         BadInput: the file cannot be written.
     """
     tensors = {"input_scale": np.asarray(policy.input_scale)}
-    for index, (weight, bias) in enumerate(zip(policy.actor.weights, policy.actor.biases, strict=True)):
-        tensors[f"actor.{index}.weight"] = np.asarray(weight)
-        tensors[f"actor.{index}.bias"] = np.asarray(bias)
-    header = {
-        "format": FORMAT,
-        "squash": policy.squash,
-        "observation": observation.LAYOUT,
-        "action": ACTION,
-        "rate": "100 Hz",
-        "about": policy.about,
-    }
+    for part, layers in (("weight", policy.actor.weights), ("bias", policy.actor.biases)):
+        tensors |= {f"actor.{index}.{part}": np.asarray(layer) for index, layer in enumerate(layers)}
+    header = {"format": FORMAT, "squash": policy.squash, **CONVENTIONS, "about": policy.about}
     write_bytes(path, safetensors.numpy.save(tensors, metadata={HEADER: json.dumps(header, sort_keys=True)}))
 
 
@@ -124,9 +110,9 @@ def load_policy(path: Path) -> Policy:
         raise BadInput(f"{path}: no such file. Give a run directory or a .safetensors policy.") from None
     except (safetensors.SafetensorError, OSError, ValueError) as error:
         raise BadInput(f"{path}: is not a policy ({error}). Give a .safetensors file written by flytune.") from None
-    if not isinstance(header, dict) or header.get("format") != FORMAT:
-        found = header.get("format") if isinstance(header, dict) else None
-        raise BadInput(f"{path}: is not a flytune policy (format {found!r}). Allowed: {FORMAT}.")
+    header = header if isinstance(header, dict) else {}
+    if header.get("format") != FORMAT:
+        raise BadInput(f"{path}: is not a flytune policy (format {header.get('format')!r}). Allowed: {FORMAT}.")
     if not isinstance(header.get("about", {}), dict):
         raise BadInput(f"{path}: has a damaged header. Train it again.")
     if header.get("observation") != observation.LAYOUT:
@@ -142,26 +128,20 @@ def _assemble(path: Path, header: dict[str, Any], tensors: dict[str, np.ndarray]
     names = {"input_scale", *(f"actor.{i}.{part}" for i in range(layers) for part in ("weight", "bias"))}
     if layers < 1 or set(tensors) != names or header.get("squash") not in ("clip", "tanh"):
         raise BadInput(f"{path}: is a damaged policy (tensors {sorted(tensors)}). Train it again.")
-    shapes = [tensors[f"actor.{index}.weight"].shape for index in range(layers)]
-    for index, shape in enumerate(shapes):
-        if len(shape) != 2:
-            raise BadInput(f"{path}: layer {index} has shape {shape}, allowed: a matrix. Train it again.")
-    sizes = [observation.SIZE, *(shape[1] for shape in shapes)]
-    for index in range(layers):
-        wanted = (sizes[index], sizes[index + 1])
-        weight, bias = tensors[f"actor.{index}.weight"], tensors[f"actor.{index}.bias"]
-        if weight.shape != wanted or bias.shape != wanted[1:]:
+    weights, biases = ([tensors[f"actor.{i}.{part}"] for i in range(layers)] for part in ("weight", "bias"))
+    width = observation.SIZE
+    for index, (weight, bias) in enumerate(zip(weights, biases, strict=True)):
+        wanted = (width, weight.shape[1]) if weight.ndim == 2 else "a matrix"
+        if weight.shape != wanted or bias.shape != weight.shape[1:]:
             raise BadInput(f"{path}: layer {index} has shape {weight.shape}, allowed: {wanted}. Train it again.")
-    if sizes[-1] != 4 or tensors["input_scale"].shape != (observation.SIZE,):
-        raise BadInput(f"{path}: maps {tensors['input_scale'].shape} to {sizes[-1]}, allowed: 17 to 4. Train it again.")
+        width = weight.shape[1]
+    if width != 4 or tensors["input_scale"].shape != (observation.SIZE,):
+        raise BadInput(f"{path}: maps {tensors['input_scale'].shape} to {width}, allowed: 17 to 4. Train it again.")
     for name, tensor in tensors.items():
         if not np.all(np.isfinite(tensor)):
             raise BadInput(f"{path}: {name} holds numbers that are not finite. Train it again.")
     return Policy(
-        actor=Network(
-            weights=tuple(jnp.asarray(tensors[f"actor.{i}.weight"]) for i in range(layers)),
-            biases=tuple(jnp.asarray(tensors[f"actor.{i}.bias"]) for i in range(layers)),
-        ),
+        actor=Network(weights=tuple(map(jnp.asarray, weights)), biases=tuple(map(jnp.asarray, biases))),
         input_scale=jnp.asarray(tensors["input_scale"]),
         squash=header["squash"],
         about=header.get("about", {}),

@@ -1,14 +1,12 @@
 """Policies for use outside flytune, and readers of policies that were made elsewhere."""
 
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any, Literal
 
 from flytune.errors import BadInput
 
-Format = Literal["onnx", "safetensors"]
 
-
-def export_policy(policy: Any, path: str | Path, format: Format = "onnx") -> Path:
+def export_policy(policy: Any, path: str | Path, format: Literal["onnx", "safetensors"] = "onnx") -> Path:
     """Write a policy for use outside flytune; returns the path of the file.
 
     Args:
@@ -25,7 +23,7 @@ def export_policy(policy: Any, path: str | Path, format: Format = "onnx") -> Pat
 
     writers = {"onnx": save_onnx, "safetensors": save_policy}
     if format not in writers:
-        raise BadInput(f"format: {format!r} is unknown. Allowed: {', '.join(get_args(Format))}.")
+        raise BadInput(f"format: {format!r} is unknown. Allowed: {', '.join(writers)}.")
     learned = getattr(policy, "controller", policy)
     if not isinstance(learned, Policy):
         name = getattr(policy, "name", type(learned).__name__)

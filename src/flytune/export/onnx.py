@@ -14,10 +14,10 @@ import numpy as np
 from jaxtyping import Float
 
 from flytune.config.files import write_bytes
-from flytune.control.policy import Policy
+from flytune.control.policy import CONVENTIONS, Policy
 from flytune.errors import BadInput, require
-from flytune.export.untrusted.onnx_controller import OnnxController, load_onnx, read_onnx
-from flytune.export.untrusted.onnx_session import CONVENTIONS, FORMAT, INPUT, OUTPUT, VERSION, sample_observations
+from flytune.export.untrusted.onnx_controller import OnnxController, load_onnx, read_onnx, sample_observations
+from flytune.export.untrusted.onnx_inspection import FORMAT, INPUT, OUTPUT, VERSION
 from flytune.task.observation import SIZE
 
 __all__ = ["CONVENTIONS", "OnnxController", "check_actions", "load_onnx", "rounding_bound", "save_onnx"]

@@ -1,4 +1,4 @@
-"""Rotors for simulators that know only forces: action to rotor speed, with lag and latency. NumPy, float64.
+"""Rotors for simulators that take forces: from action to rotor speed, with lag and latency. NumPy, float64.
 
 The equations are those of `physics.dynamics`, repeated because a simulator in C takes plain numbers and steps itself.
 """
@@ -10,7 +10,7 @@ from flytune.physics.vehicle import Vehicle
 
 
 class Actuator:
-    """The four rotors of each of N vehicles: speeds now, and the actions on their way to them."""
+    """The four rotors of each of N vehicles: their speeds, and the pending actions."""
 
     def __init__(self, vehicle: Vehicle, number: int) -> None:
         self._vehicle = vehicle
@@ -20,13 +20,13 @@ class Actuator:
         self._pending = np.zeros((number, vehicle.action_latency_steps, 4))  # oldest first
 
     def place(self, rotor_speed_rpm: Float[np.ndarray, "K 4"], which: np.ndarray | None = None) -> None:
-        """Let the rotors turn at these speeds, with no action on its way to them; see `Simulator.place`."""
+        """Set the rotor speeds, with no pending action; see `Simulator.place`."""
         chosen = slice(None) if which is None else which
         self.rotor_speed_rpm[chosen] = rotor_speed_rpm
         self._pending[chosen] = 0.0
 
     def command(self, action: Float[np.ndarray, "N 4"]) -> None:
-        """Take in the actions of a control period: what comes out of the latency now moves the motors.
+        """Accept the actions of a control period; those that the latency has delayed until now move the motors.
 
             rpm = min(hover speed * (1 + action_scale * clip(action, -1, 1)), maximum)
 
@@ -39,7 +39,7 @@ class Actuator:
         self._commanded = np.minimum(wanted, vehicle.maximum_rotor_speed_rpm)
 
     def turn(self, duration: float) -> Float[np.ndarray, "N 4"]:
-        """Let `duration` seconds pass; the rotor speeds in rpm at the middle of it.
+        """The rotor speeds in rpm at the middle of the next `duration` seconds, which are simulated.
 
         A simulator that holds its forces through a step is of second order in the lag with the speeds of the middle,
         and of first order with those of either end.
@@ -50,10 +50,7 @@ class Actuator:
 
     def _after(self, elapsed: float) -> Float[np.ndarray, "N 4"]:
         """The exact first-order response: command + (speed - command) exp(-t / tau), see `rotor_speed_after`."""
-        rise, fall = self._vehicle.motor_rise_time_constant, self._vehicle.motor_fall_time_constant
+        constants = self._vehicle.motor_rise_time_constant, self._vehicle.motor_fall_time_constant
+        rise, fall = (float(np.exp(-elapsed / constant)) if constant > 0 else 0.0 for constant in constants)
         now, goal = self.rotor_speed_rpm, self._commanded
-        return goal + (now - goal) * np.where(goal > now, _share_left(rise, elapsed), _share_left(fall, elapsed))
-
-
-def _share_left(time_constant: float, elapsed: float) -> float:
-    return float(np.exp(-elapsed / time_constant)) if time_constant > 0 else 0.0
+        return goal + (now - goal) * np.where(goal > now, rise, fall)

@@ -1,4 +1,4 @@
-"""What air does to a small quadrotor beyond thrust, as the paper's simulator models it. NumPy, float64."""
+"""Ground effect and rotor drag of a small quadrotor, as the paper's simulator models them. NumPy, float64."""
 
 import numpy as np
 from jaxtyping import Float
@@ -8,9 +8,7 @@ from flytune.physics.vehicle import Vehicle
 from flytune.simulation.simulator import rotation_matrix, to_body, to_inertial
 
 GROUND_EFFECT_COEFFICIENT = 11.36859  # 1; gym-pybullet-drones (MIT licence), cf2x.urdf: gnd_eff_coeff
-LARGEST_GROUND_EFFECT = (
-    4 / 15
-)  # of the thrust; what gym-pybullet-drones' lowest height, r sqrt(15 k / 4) / 4, amounts to
+LARGEST_GROUND_EFFECT = 4 / 15  # of the thrust: at gym-pybullet-drones' lowest height, r sqrt(15 k / 4) / 4
 ROTOR_DRAG = np.array([9.1785e-7, 9.1785e-7, 10.311e-7])  # kg/rad; Forster 2015, Crazyflie 2.0, body axes
 RAD_PER_S = 2 * np.pi / 60  # of one rpm
 
@@ -18,11 +16,11 @@ RAD_PER_S = 2 * np.pi / 60  # of one rpm
 def ground_effect(
     vehicle: Vehicle, position: Float[np.ndarray, "N 3"], attitude: Float[np.ndarray, "N 4"]
 ) -> Float[np.ndarray, "N 4"]:
-    """By which share each propeller's thrust grows above a floor at z = 0.
+    """The share by which each propeller's thrust grows above a floor at z = 0.
 
         gain = min(4 / 15, k (r / 4 h)^2),  h the height of the propeller, r its radius
 
-    No gain on the back. There is no floor to hit: below it the gain stays at its largest.
+    A vehicle upside down has no gain. The floor does not stop a vehicle: below it the gain stays at its largest.
 
     Source: Panerati et al., Learning to Fly, IROS 2021, after Shi et al., Neural Lander, ICRA 2019; k and the lowest
     height as in gym-pybullet-drones.

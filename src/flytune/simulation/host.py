@@ -1,8 +1,8 @@
 """The rollout on the host: episodes stepped one control period at a time, in any simulator, behind NumPy arrays.
 
-It serves simulators that JAX cannot look into, and interfaces that ask for one step at a time. A call of compiled code
-costs more per array that goes in or comes out than its arithmetic: so the task's numbers, the episodes and the report
-each cross as one array of float32, which holds the whole numbers among them exactly.
+It serves simulators that JAX cannot differentiate, and interfaces that ask for one step at a time. In a call of
+compiled code, each array that goes in or comes out costs more time than the arithmetic: so the task's numbers, the
+episodes and the report are one array of float32 each, which holds the whole numbers among them exactly.
 """
 
 import dataclasses
@@ -53,7 +53,7 @@ class Transition:
     observation = _vectors(0)  # [N, 17] the next one, of the new episode where the old one ended
     final_observation = _vectors(1)  # [N, 17] of the state the action led to, before any new episode
     states = _vectors(2)  # [N, 17] of `observation`: position, attitude, velocity, body rate, rotor speeds in rpm
-    placed = _vectors(3)  # [N, 17] states for a simulator that JAX cannot look into, where an episode is over
+    placed = _vectors(3)  # [N, 17] states for a simulator without `physics`, where an episode is over
     reward = _numbers(0)  # [N]
     cause = _numbers(1, int)  # [N] why an episode failed, an index into `causes(task.termination)`, or SAFE
     truncated = _numbers(2, bool)  # [N] the horizon is reached; the rewards that would follow still count
@@ -97,21 +97,21 @@ ENDINGS: dict[str, Callable[..., Any]] = {
 class HostEnvironment:
     """N episodes of one task in one simulator, which step together.
 
-    `episodes`, `key` and `observation` are all that changes in flytune's own simulator: kept and put back, they let it
-    go on exactly as before.
+    In flytune's own simulator, only `episodes`, `key` and `observation` change: with these restored, it goes on exactly
+    as before.
 
     Args:
-        task: what is flown.
-        simulator: with N vehicles in it.
+        task: of the episodes.
+        simulator: of N vehicles.
         number: N.
         ending: what follows the end of an episode, one of `ENDINGS`.
     """
 
     def __init__(self, task: Task, simulator: Simulator, number: int, ending: str = "restart") -> None:
         self.task, self.number, self.simulator = task, number, simulator
-        leaves, structure = jax.tree.flatten(task)
+        leaves, self._structure = jax.tree.flatten(task)
         self._numbers = jnp.asarray(np.asarray(leaves, np.float32))
-        self._structure, self._ending = structure, ending
+        self._ending = ending
         self._terms = tuple(sorted(task.reward))
         self.key: Any = None  # of noise and new episodes, where `step` is given none
         self.episodes: Any = np.zeros((0, number), np.float32)  # [K, N], see `unravel`
@@ -126,8 +126,7 @@ class HostEnvironment:
         """
         if seed is not None:
             self.key = jax.random.key(seed)
-        key, episodes, report = _draw(self._structure, self.number, self._numbers, self.key)
-        self.key = key
+        self.key, episodes, report = _draw(self._structure, self.number, self._numbers, self.key)
         return self._take(episodes, np.array(report), which)
 
     def start(self, episodes: Any, noise: Noise) -> np.ndarray:
@@ -150,9 +149,7 @@ class HostEnvironment:
     def step(self, action: np.ndarray, noise: Noise | None = None) -> Transition:
         """The result of actions [N, 4]; they are clipped to [-1, 1].
 
-        Args:
-            action: one per vehicle.
-            noise: 13 standard normal numbers for each observation; drawn with the environment's own key where None.
+        The noise is 13 standard normal numbers for each observation, drawn with the environment's own key where None.
         """
         physics, reached = self.simulator.physics, None
         action = np.asarray(action, np.float32)
@@ -178,7 +175,7 @@ class HostEnvironment:
         return np.asarray(_steps(self._structure, self._numbers, self.episodes)).astype(int)
 
     def close(self) -> None:
-        """Give the simulator's memory back."""
+        """Free the memory of the simulator."""
         self.simulator.close()
 
 
@@ -247,7 +244,7 @@ def _step(
     noise: Any,
     reached: Array | None,
 ) -> tuple[Array | None, Array, Array]:
-    """The key, the episodes after a step, and all that `HostEnvironment` tells of it, as one array."""
+    """The key, the episodes after a step, and the report of a `Transition`."""
     task, number = jax.tree.unflatten(structure, list(numbers)), action.shape[0]
     before, keys = unravel(task, episodes), None
     if key is not None:
@@ -258,7 +255,7 @@ def _step(
     def one(episode: Episode, action: Array, elsewhere: Any, key: Any) -> Any:
         if elsewhere is None:
             moved, outcome = environment.step(task, episode, action, physics)
-        else:  # what is on its way to the motors stays in the simulator
+        else:  # pending actions stay in the simulator
             state = state_from(elsewhere, episode.state.pending_actions)
             moved, outcome = environment.assess(task, episode, state, jnp.clip(action, -1.0, 1.0))
         return *ENDINGS[ending](task, episode, moved, outcome, key), moved, outcome
@@ -271,7 +268,7 @@ def _step(
     if ending == "hold":  # where the simulator has no trouble with a crashed vehicle
         at_target = state_numbers(hovering(task.vehicle, task.target.position))
         placed = jnp.broadcast_to(at_target[:, None], states.shape)
-    told = [outcome.reward, outcome.cause, outcome.truncated, moved.reward, moved.steps, over]
-    told += [outcome.terms[name] for name in sorted(outcome.terms)]
-    told = jnp.stack([each.astype(jnp.float32) for each in told])
-    return key, ravel(after), jnp.concatenate([seen, final, states, placed, told])
+    results = [outcome.reward, outcome.cause, outcome.truncated, moved.reward, moved.steps, over]
+    results += [outcome.terms[name] for name in sorted(outcome.terms)]
+    rows = jnp.stack([each.astype(jnp.float32) for each in results])
+    return key, ravel(after), jnp.concatenate([seen, final, states, placed, rows])

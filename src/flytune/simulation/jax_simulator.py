@@ -25,35 +25,32 @@ class JaxSimulatorOptions:
 
 
 class JaxSimulator:
-    """N vehicles under `physics.dynamics`, in float32."""
+    """N vehicles under `physics.dynamics`, in float32; see `Simulator`."""
 
     physics: Physics | None
 
     def __init__(self, vehicle: Vehicle, number: int, options: JaxSimulatorOptions | None = None) -> None:
         self.physics = self._step = _physics((options or JaxSimulatorOptions()).physics_steps)
-        self._vehicle, self._latency = vehicle, vehicle.action_latency_steps
+        self._vehicle = vehicle
         hovering = np.asarray(state_numbers(dynamics.hovering(vehicle, (0.0, 0.0, 0.0))))
         self._numbers = np.repeat(hovering[:, None], number, axis=1)
-        self._pending = np.zeros((self._latency, 4, number), np.float32)
+        self._pending = np.zeros((vehicle.action_latency_steps, 4, number), np.float32)
 
     def place(self, states: VehicleStates, which: np.ndarray | None = None) -> None:
-        """Put the vehicles there, see `Simulator`."""
         chosen = slice(None) if which is None else which
         self._numbers, self._pending = np.array(self._numbers), np.array(self._pending)
         self._numbers[:, chosen] = states.rows().T
         self._pending[..., chosen] = 0.0
 
     def advance(self, action: np.ndarray) -> None:
-        """Let one control period pass, see `Simulator`."""
         given = np.asarray(action, np.float32).T
         self._numbers, self._pending = _advance(self._step, self._vehicle, self._numbers, self._pending, given)
 
     def states(self) -> VehicleStates:
-        """The states of the vehicles now, see `Simulator`."""
         return VehicleStates.from_rows(np.asarray(self._numbers, float).T)
 
     def close(self) -> None:
-        """Nothing to give back."""
+        """Nothing to free."""
 
 
 @lru_cache  # the same function for the same number, so that one compiled program serves every simulator

@@ -10,13 +10,13 @@ from flytune.physics.vehicle import Vehicle
 
 Integrator = Literal["RK4", "Euler", "implicit", "implicitfast"]
 
-THICKNESS = 2e-3  # m, of what is drawn; it is neither weighed nor touched
+THICKNESS = 2e-3  # m, of the shapes that are drawn; they have neither mass nor contact
 
 
 def urdf(vehicle: Vehicle) -> str:
     """The vehicle as URDF: one link with mass and inertia, drawn with a disc at each motor.
 
-    It has no collision shapes, and URDF knows neither rotors nor drag: the forces are left to the caller.
+    It has no collision shapes, and URDF has neither rotors nor drag: the caller applies the forces.
     """
     ixx, iyy, izz = map(float, vehicle.inertia)
     side = reach(vehicle) / math.sqrt(2)
@@ -51,13 +51,8 @@ def urdf(vehicle: Vehicle) -> str:
 def mjcf(vehicle: Vehicle, *, timestep: float = CONTROL_PERIOD / 2, integrator: Integrator = "RK4") -> str:
     """The vehicle as MJCF: a free body, a site at each motor, and an actuator on it whose control is thrust in N.
 
-    A motor's torque about z comes with its thrust, km / kf times as large. Rotor lag and latency are left to the
-    caller, and so is drag, for which a free joint has one coefficient where a vehicle has three.
-
-    Args:
-        vehicle: what is described.
-        timestep: of the physics, s.
-        integrator: by MuJoCo's names.
+    A motor's torque about z is km / kf times its thrust. The caller simulates rotor lag and latency, and sets the drag,
+    for which a free joint has one coefficient and a vehicle three.
     """
     ratio = float(vehicle.torque_coefficient / vehicle.thrust_coefficient)
     strongest = float(thrust(vehicle, vehicle.maximum_rotor_speed_rpm**2))
@@ -98,13 +93,8 @@ def mjcf(vehicle: Vehicle, *, timestep: float = CONTROL_PERIOD / 2, integrator: 
 """
 
 
-def motor_positions(vehicle: Vehicle) -> list[list[float]]:
-    """Where the four motors sit in the body frame, m."""
-    return [[float(x), float(y), 0.0] for x, y in places(vehicle)]
-
-
 def _motor_places(vehicle: Vehicle) -> list[str]:
-    return [_numbers(place) for place in motor_positions(vehicle)]
+    return [_numbers((x, y, 0.0)) for x, y in places(vehicle)]
 
 
 def _numbers(values: Iterable[float]) -> str:
@@ -112,5 +102,5 @@ def _numbers(values: Iterable[float]) -> str:
 
 
 def _name(vehicle: Vehicle) -> str:
-    """The vehicle's name, as far as XML takes it unquoted."""
+    """The vehicle's name, without the characters that XML does not allow unquoted."""
     return "".join(c for c in vehicle.name if c.isalnum() or c in " -_.@") or "vehicle"

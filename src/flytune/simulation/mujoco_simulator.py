@@ -29,10 +29,10 @@ class MujocoOptions:
 
 
 class MujocoSimulator:
-    """N vehicles as N states of one MuJoCo model, in float64.
+    """N vehicles as N states of one MuJoCo model, in float64; see `Simulator`.
 
-    A free joint's velocity is inertial and its angular velocity is of the body, as flytune has them. The vehicle's
-    drag is set as damping on the three directions of the joint, so that MuJoCo's integrators know of it.
+    A free joint has its velocity in the inertial frame and its angular velocity in the body frame, as flytune does. The
+    vehicle's drag is set as damping on the three directions of the joint, so that MuJoCo's integrators include it.
     """
 
     physics = None
@@ -55,7 +55,6 @@ class MujocoSimulator:
         self._state[:, ATTITUDE] = 1.0, 0.0, 0.0, 0.0
 
     def place(self, states: VehicleStates, which: np.ndarray | None = None) -> None:
-        """Put the vehicles there, see `Simulator`."""
         chosen = slice(None) if which is None else which
         self._state[chosen, POSITION] = states.position
         self._state[chosen, ATTITUDE] = states.attitude[:, W_FIRST]
@@ -64,7 +63,6 @@ class MujocoSimulator:
         self._actuator.place(states.rotor_speed_rpm, which)
 
     def advance(self, action: np.ndarray) -> None:
-        """Let one control period pass, see `Simulator`."""
         self._actuator.command(action)
         speeds = [self._actuator.turn(self._period) for _ in range(self._options.physics_steps)]
         controls = thrust(self._vehicle, np.stack(speeds, axis=1) ** 2)
@@ -73,7 +71,6 @@ class MujocoSimulator:
         self._state = np.array(states[:, -1])
 
     def states(self) -> VehicleStates:
-        """Where the vehicles are, see `Simulator`."""
         state = self._state
         return VehicleStates(
             position=state[:, POSITION].copy(),
@@ -84,5 +81,5 @@ class MujocoSimulator:
         )
 
     def close(self) -> None:
-        """Let go of the model; a second call does nothing."""
+        """Free the model; a second call does nothing."""
         self._model = self._data = None

@@ -1,7 +1,6 @@
 """PyBullet as a simulator: the paper's simulator (paper R6), with a force at each motor."""
 
 import tempfile
-from pathlib import Path
 from typing import Annotated
 
 import numpy as np
@@ -11,11 +10,11 @@ from flytune.config.document import Real, Whole
 from flytune.config.pytree import pytree, static
 from flytune.errors import BadInput, require
 from flytune.physics.dynamics import CONTROL_PERIOD
-from flytune.physics.rotors import spins, thrust
+from flytune.physics.rotors import places, spins, thrust
 from flytune.physics.vehicle import Vehicle
 from flytune.simulation.actuator import Actuator
 from flytune.simulation.aerodynamics import ground_effect, rotor_drag
-from flytune.simulation.model_files import motor_positions, urdf
+from flytune.simulation.model_files import urdf
 from flytune.simulation.simulator import VehicleStates, to_body, to_inertial
 
 BODY = -1  # PyBullet's index of a vehicle's base link
@@ -23,7 +22,7 @@ BODY = -1  # PyBullet's index of a vehicle's base link
 
 @pytree
 class PyBulletOptions:
-    """What is simulated beyond rigid bodies under thrust, and how finely."""
+    """The effects that are simulated beside rigid bodies under thrust, and the number of physics steps."""
 
     physics_steps: Annotated[Whole, Ge(1), Le(100), Unit("per control period")] = static(default=2)
     # slows a free body by damping * (1 + |v|) * v, and its rotation alike; Bullet's own default is 0.04
@@ -33,12 +32,11 @@ class PyBulletOptions:
 
 
 class PyBulletSimulator:
-    """N vehicles in one PyBullet client, without collisions, in float64.
+    """N vehicles in one PyBullet client, without collisions, in float64; see `Simulator`.
 
-    Bullet keeps the angular velocity in the inertial frame; it is turned into the body frame here. Its multibody
-    solver, which URDF files are loaded into, has the gyroscopic torque, advances velocities first and positions with
-    them (semi-implicit Euler, first order), and forgets forces after each step. docs/results/worlds.md has
-    measurements.
+    Bullet has the angular velocity in the inertial frame; it is turned into the body frame here. Its multibody solver,
+    which URDF files use, includes the gyroscopic torque, advances velocities first and positions with them
+    (semi-implicit Euler, first order), and clears forces after each step. docs/results/worlds.md has measurements.
     """
 
     physics = None
@@ -53,57 +51,51 @@ class PyBulletSimulator:
         self._vehicle, self._options = vehicle, options
         self._period = CONTROL_PERIOD / options.physics_steps
         self._actuator = Actuator(vehicle, number)
-        self._motors, self._spins = motor_positions(vehicle), np.array(spins(vehicle))
+        self._motors, self._spins = [[x, y, 0.0] for x, y in places(vehicle).tolist()], np.array(spins(vehicle))
         self._drag = np.array(vehicle.drag, float)
         self._client = self._bullet.connect(self._bullet.DIRECT)
         if self._client < 0:
             raise BadInput("pybullet: no client is left. Close a simulator that is no longer needed.")
         self._bullet.setGravity(0, 0, -float(vehicle.gravity), physicsClientId=self._client)
         self._bullet.setTimeStep(self._period, physicsClientId=self._client)
-        self._vehicles = self._load(number)
+        with tempfile.NamedTemporaryFile("w", suffix=".urdf", encoding="utf-8") as file:
+            file.write(urdf(vehicle))
+            file.flush()
+            self._vehicles = [self._load(file.name) for _ in range(number)]
 
-    def _load(self, number: int) -> list[int]:
-        """PyBullet's numbers of the vehicles."""
-        bullet, client = self._bullet, self._client
-        with tempfile.TemporaryDirectory() as folder:
-            file = Path(folder) / "vehicle.urdf"
-            file.write_text(urdf(self._vehicle), encoding="utf-8")
-            flags = bullet.URDF_USE_INERTIA_FROM_FILE  # else Bullet works one out from the collision shape
-            vehicles = [bullet.loadURDF(str(file), flags=flags, physicsClientId=client) for _ in range(number)]
-        for vehicle in vehicles:
-            bullet.changeDynamics(
-                vehicle,
-                BODY,
-                linearDamping=float(self._options.damping),
-                angularDamping=float(self._options.damping),
-                activationState=bullet.ACTIVATION_STATE_DISABLE_SLEEPING,
-                physicsClientId=client,
-            )
-        return vehicles
+    def _load(self, file: str) -> int:
+        """PyBullet's number of a new vehicle."""
+        bullet, damping = self._bullet, float(self._options.damping)
+        flags = bullet.URDF_USE_INERTIA_FROM_FILE  # else Bullet computes the inertia from the collision shape
+        vehicle = bullet.loadURDF(file, flags=flags, physicsClientId=self._client)
+        bullet.changeDynamics(
+            vehicle,
+            BODY,
+            linearDamping=damping,
+            angularDamping=damping,
+            activationState=bullet.ACTIVATION_STATE_DISABLE_SLEEPING,
+            physicsClientId=self._client,
+        )
+        return vehicle
 
     def place(self, states: VehicleStates, which: np.ndarray | None = None) -> None:
-        """Put the vehicles there, see `Simulator`."""
         chosen = range(len(self._vehicles)) if which is None else which
         turning = to_inertial(np.asarray(states.attitude, float), np.asarray(states.body_rate, float))
-        for row, index in enumerate(chosen):
+        parts = (part.tolist() for part in (states.position, states.attitude, states.velocity, turning))
+        for index, position, attitude, velocity, rate in zip(chosen, *parts, strict=True):
             vehicle = self._vehicles[int(index)]
-            self._bullet.resetBasePositionAndOrientation(
-                vehicle, states.position[row].tolist(), states.attitude[row].tolist(), physicsClientId=self._client
-            )
-            self._bullet.resetBaseVelocity(
-                vehicle, states.velocity[row].tolist(), turning[row].tolist(), physicsClientId=self._client
-            )
+            self._bullet.resetBasePositionAndOrientation(vehicle, position, attitude, physicsClientId=self._client)
+            self._bullet.resetBaseVelocity(vehicle, velocity, rate, physicsClientId=self._client)
         self._actuator.place(states.rotor_speed_rpm, which)
 
     def advance(self, action: np.ndarray) -> None:
-        """Let one control period pass, see `Simulator`."""
         self._actuator.command(action)
         for _ in range(self._options.physics_steps):
             self._push(self._actuator.turn(self._period))
             self._bullet.stepSimulation(physicsClientId=self._client)
 
     def _push(self, rotor_speed_rpm: np.ndarray) -> None:
-        """Apply the forces of a physics step: a thrust at each motor, their torque about z, and what the air does."""
+        """Apply the forces of a physics step: a thrust at each motor, their torque about z, drag and ground effect."""
         bullet, client, frame = self._bullet, self._client, self._bullet.LINK_FRAME
         squared = rotor_speed_rpm**2
         forces = thrust(self._vehicle, squared)
@@ -128,7 +120,6 @@ class PyBulletSimulator:
         return forces * (1 + ground_effect(self._vehicle, body.position, body.attitude))
 
     def states(self) -> VehicleStates:
-        """Where the vehicles are, see `Simulator`."""
         bullet, client = self._bullet, self._client
         places = [bullet.getBasePositionAndOrientation(vehicle, client) for vehicle in self._vehicles]
         motions = np.array([bullet.getBaseVelocity(vehicle, client) for vehicle in self._vehicles])

@@ -1,4 +1,4 @@
-"""The simulator protocol, and vehicle states as arrays: what crosses the border between a simulator and all else."""
+"""The simulator protocol, and vehicle states as arrays, in which all simulators take and give them."""
 
 import dataclasses
 from collections.abc import Callable
@@ -38,7 +38,7 @@ class VehicleStates:
 
 @runtime_checkable
 class Simulator(Protocol):
-    """N vehicles of one kind, side by side; they do not touch each other."""
+    """N vehicles of one kind that do not touch each other."""
 
     @property
     def physics(self) -> Callable[..., Any] | None:
@@ -46,14 +46,14 @@ class Simulator(Protocol):
         ...
 
     def place(self, states: VehicleStates, which: Int[np.ndarray, "K"] | None = None) -> None:
-        """Put the vehicles there: all N of them, or those at the K indices `which`, and then `states` holds K.
+        """Put the vehicles into states: all N of them, or the K at the indices `which`, and then `states` holds K.
 
-        Their rotors turn at the speeds `states` gives, and no action is on its way to them.
+        Their rotors turn at the speeds in `states`, and no delayed action is pending.
         """
         ...
 
     def advance(self, action: Float[np.ndarray, "N 4"]) -> None:
-        """Let one control period (0.01 s) pass under actions [N, 4], clipped to [-1, 1]."""
+        """Simulate one control period (0.01 s) under actions [N, 4], clipped to [-1, 1]."""
         ...
 
     def states(self) -> VehicleStates:
@@ -61,17 +61,17 @@ class Simulator(Protocol):
         ...
 
     def close(self) -> None:
-        """Give the simulator's memory back."""
+        """Free the memory of the simulator."""
         ...
 
 
 def state_numbers(state: State) -> Float[Array, "17 *batch"]:
-    """A state as one array, one number of every vehicle after the other; actions on their way are left out."""
+    """A state as one array, one number of every vehicle after the other; pending actions are left out."""
     return jnp.stack([number for name in WIDTHS for number in getattr(state, name)])
 
 
 def state_from(numbers: Float[Array, "17 *batch"], pending_actions: jax.Array) -> State:
-    """The state whose numbers these are, with its actions on their way [latency, 4, ...]."""
+    """The state whose numbers these are, with its pending actions [latency, 4, ...]."""
     parts, first = {}, 0
     for name, width in WIDTHS.items():
         parts[name] = tuple(numbers[first : first + width])

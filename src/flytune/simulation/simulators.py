@@ -16,8 +16,8 @@ def make_simulator(name: str, vehicle: Vehicle, number: int, options: Mapping[st
 
     Args:
         name: one of `SIMULATORS`.
-        vehicle: what is simulated.
-        number: how many, 1 or more.
+        vehicle: the model of each.
+        number: of vehicles, 1 or more.
         options: of that simulator: `PyBulletOptions`, `MujocoOptions` or `JaxSimulatorOptions`.
 
     Raises:

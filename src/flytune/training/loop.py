@@ -13,12 +13,12 @@ from typing import Any
 import jax
 
 from flytune.control.policy import Policy
-from flytune.errors import BadInput, Interrupted
+from flytune.errors import BadInput, Interrupted, require
 from flytune.runs.directory import RunDirectory, resume_command
 from flytune.task.task import Task, write_task
 from flytune.training.progress import Clock, Progress
-from flytune.training.tensorboard import EventLog, check_tensorboard
-from flytune.training.trainer import DEFAULT_TRAINER, Trainer, find_trainer
+from flytune.training.tensorboard import EventLog
+from flytune.training.trainer import DEFAULT_TRAINER, find_trainer
 from flytune.training.update import metrics_row
 
 CHECKPOINT_INTERVAL = 30.0  # s between checkpoints
@@ -31,7 +31,7 @@ class Run:
     task: Task
     trainer: str
     seed: int
-    policy: Policy  # the one that is flown: the moving average of the weights
+    policy: Policy  # of the moving average of the weights
     last_policy: Policy  # the weights of the last update
     metrics: list[dict[str, Any]]  # one row per update, as in metrics.jsonl
     directory: Path | None
@@ -59,7 +59,7 @@ def train(
     sets this).
 
     Args:
-        task: what to learn; it holds the settings of the trainer.
+        task: also holds the settings of the trainer.
         trainer: the name of one of `TRAINERS`: `apg`, `ppo` or `sb3`.
         seed: of the weights, the episodes and the noise; 0 or more.
         out: run directory to write; nothing is written where None.
@@ -80,7 +80,7 @@ def train(
         method.check_warm_start(task, warm_start)
     method.check(task)
     if tensorboard:
-        check_tensorboard()
+        require("tensorboard", "tensorboard")
         if out is None:
             raise BadInput("tensorboard: needs out, the run directory to write its event files into.")
 
@@ -91,24 +91,37 @@ def train(
             train_state = method.warm_start(task, train_state, warm_start)
         if directory is not None and resume:
             train_state, rows = directory.resume(train_state)
-        clock = _clock(method, task, seed, rows)
+        settings = method.settings(task)
+        clock = Clock(f"{task.name}  {trainer}  seed {seed}", settings, rows)
         saved = time.monotonic()
         with EventLog(out, rows) if tensorboard and out is not None else contextlib.nullcontext() as log:
-            for train_state, row in _updates(method, task, train_state, len(rows), clock):  # noqa: B020
+            for update in range(len(rows) + 1, settings.updates + 1):
+                train_state, measured = method.update(task, train_state)
+                jax.block_until_ready(measured)
+                steps = update * settings.steps_per_update
+                row = metrics_row(task, measured, update, steps, clock.seconds(update))
                 rows.append(row)
                 if log is not None:
                     log.write(row)
                 if on_progress is not None:
-                    on_progress(clock.progress(row["update"], row["reward"]))
+                    on_progress(clock.progress(update, row["reward"]))
                 if directory is not None and (interrupted.is_set() or time.monotonic() - saved > CHECKPOINT_INTERVAL):
                     directory.checkpoint(train_state, rows)
                     saved = time.monotonic()
                 if interrupted.is_set():
-                    raise _interruption(directory, trainer, seed, row["steps"])
+                    raise _interruption(directory, trainer, seed, steps)
         if directory is not None:
             directory.checkpoint(train_state, rows)
 
-    about = _about(task, trainer, seed, rows)
+    about = {  # the facts in the header of a policy file
+        "task": task.name,
+        "vehicle": task.vehicle.name,
+        "task_toml": write_task(task),
+        "trainer": trainer,
+        "seed": seed,
+        "steps": rows[-1]["steps"] if rows else 0,
+        "version": metadata.version("flytune"),
+    }
     run = Run(
         task=task,
         trainer=trainer,
@@ -121,23 +134,6 @@ def train(
     if directory is not None:
         directory.finish(run.policy, run.last_policy, rows[-1])
     return run
-
-
-def _clock(method: Trainer, task: Task, seed: int, rows: list[dict[str, Any]]) -> Clock:
-    settings = method.settings(task)
-    label, before = f"{task.name}  {method.name}  seed {seed}", rows[-1]["seconds"] if rows else 0.0
-    return Clock(label, settings.updates, settings.steps_per_update, len(rows), before)
-
-
-def _updates(
-    method: Trainer, task: Task, train_state: Any, done: int, clock: Clock
-) -> Iterator[tuple[Any, dict[str, Any]]]:
-    """The training state and the row of the metrics after each update that is left."""
-    for update in range(done + 1, clock.updates + 1):
-        train_state, measured = method.update(task, train_state)
-        jax.block_until_ready(measured)
-        steps = update * clock.steps_per_update
-        yield train_state, metrics_row(task, measured, update, steps, clock.seconds(update))
 
 
 @contextlib.contextmanager
@@ -168,16 +164,3 @@ def _interruption(directory: RunDirectory | None, trainer: str, seed: int, steps
         f"interrupted after {steps} environment steps; checkpoint saved in {directory.path / 'checkpoint'}. "
         f"Continue with: {resume_command(directory.path, trainer, seed)}"
     )
-
-
-def _about(task: Task, trainer: str, seed: int, rows: list[dict[str, Any]]) -> dict[str, Any]:
-    """The facts in the header of a policy file."""
-    return {
-        "task": task.name,
-        "vehicle": task.vehicle.name,
-        "task_toml": write_task(task),
-        "trainer": trainer,
-        "seed": seed,
-        "steps": rows[-1]["steps"] if rows else 0,
-        "version": metadata.version("flytune"),
-    }

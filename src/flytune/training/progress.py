@@ -5,10 +5,13 @@ import dataclasses
 import sys
 import time
 from collections.abc import Callable, Iterator
+from typing import Any
 
 from rich.console import Console
 from rich.progress import BarColumn, TaskProgressColumn, TextColumn
 from rich.progress import Progress as Bar
+
+from flytune.task.training_settings import TrainerSettings
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -27,17 +30,12 @@ class Progress:
 class Clock:
     """The time and the speed of a training. The first update compiles, so later updates alone give the speed.
 
-    Args:
-        label: of the training.
-        updates: number of updates of the whole training.
-        steps_per_update: environment steps of one update.
-        first: number of updates before this process, where a training is resumed.
-        before: seconds of these updates.
+    `rows` are the metrics of the updates before this process, where a training is resumed.
     """
 
-    def __init__(self, label: str, updates: int, steps_per_update: int, first: int = 0, before: float = 0.0) -> None:
-        self.label, self.updates, self.steps_per_update = label, updates, steps_per_update
-        self._first, self._before = first, before
+    def __init__(self, label: str, settings: TrainerSettings, rows: list[dict[str, Any]]) -> None:
+        self._label, self._settings = label, settings
+        self._first, self._before = len(rows), rows[-1]["seconds"] if rows else 0.0
         self._started = self._compiled = time.monotonic()
 
     def seconds(self, update: int) -> float:
@@ -51,14 +49,15 @@ class Clock:
         """How far the training is after an update."""
         since = self._compiled if update > self._first + 1 else self._started
         counted = max(update - self._first - 1, 1)
-        rate = counted * self.steps_per_update / max(time.monotonic() - since, 1e-9)
+        updates, steps_per_update = self._settings.updates, self._settings.steps_per_update
+        rate = counted * steps_per_update / max(time.monotonic() - since, 1e-9)
         return Progress(
-            label=self.label,
+            label=self._label,
             update=update,
-            updates=self.updates,
-            steps=update * self.steps_per_update,
+            updates=updates,
+            steps=update * steps_per_update,
             steps_per_second=rate,
-            seconds_left=(self.updates - update) * self.steps_per_update / rate,
+            seconds_left=(updates - update) * steps_per_update / rate,
             reward=reward,
         )
 
@@ -68,13 +67,8 @@ def show_progress() -> Iterator[Callable[[Progress], None]]:
     """The function for `on_progress` of `train`: it draws a bar on a terminal, and prints ten lines elsewhere."""
     console = Console(stderr=True)
     if console.is_terminal:
-        columns = (
-            TextColumn("{task.description}"),
-            BarColumn(20),
-            TaskProgressColumn(),
-            TextColumn("{task.fields[text]}"),
-        )
-        with Bar(*columns, console=console) as bar:
+        name, text = TextColumn("{task.description}"), TextColumn("{task.fields[text]}")
+        with Bar(name, BarColumn(20), TaskProgressColumn(), text, console=console) as bar:
             # without a cache, compiling takes longest; without a message it would look like a hang
             task = bar.add_task("compiling (once per machine and program)", total=None, text="")
             yield lambda progress: bar.update(

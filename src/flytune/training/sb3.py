@@ -27,7 +27,7 @@ from flytune.task.task import Task
 from flytune.task.training_settings import PpoSettings
 from flytune.training.update import averaged, rollout_metrics
 
-LOSSES = {  # our names -> what Stable-Baselines3 logs
+LOSSES = {  # our names -> those in the log of Stable-Baselines3
     "loss": "train/loss",
     "policy_loss": "train/policy_gradient_loss",
     "value_loss": "train/value_loss",
@@ -49,7 +49,7 @@ class TrainState:
     weights: dict[str, Any]  # of actor, critic and standard deviation, by torch's names
     first_moments: dict[str, Any]  # Adam's, by the same names
     second_moments: dict[str, Any]
-    ema: Network  # exponential moving average of the actor over updates; the one that is flown
+    ema: Network  # exponential moving average of the actor over updates
     episodes: Any  # [K, N] as `HostEnvironment` keeps them
     key: Any  # raw, of initial states and noise
     observation: Any  # [N, 17] last seen
@@ -60,7 +60,7 @@ class TrainState:
 
 
 def policy(settings: PpoSettings, train_state: TrainState) -> Policy:
-    """The policy that is flown: the averaged actor's mean action."""
+    """The policy of the averaged actor: its mean action."""
     return Policy(actor=train_state.ema, input_scale=jnp.ones(SIZE), squash="clip")
 
 
@@ -74,12 +74,7 @@ def start(task: Task, settings: PpoSettings, key: jax.Array) -> TrainState:
     with _restored_generators():
         model = _Model(task, settings, int(jax.random.bits(key)))
         fields = model.read()
-    return TrainState(
-        model=model,
-        ema=actor_network(fields["weights"]),
-        updates=jnp.zeros((), jnp.int32),
-        **fields,
-    )
+    return TrainState(model=model, ema=actor_network(fields["weights"]), updates=jnp.zeros((), jnp.int32), **fields)
 
 
 def update(task: Task, settings: PpoSettings, train_state: TrainState) -> tuple[TrainState, dict[str, Any]]:

@@ -1,29 +1,21 @@
 """TensorBoard: the rows of metrics.jsonl as event files beside it, written while a training runs."""
 
+import contextlib
 import math
 import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
 from flytune.config.nested import leaves
 from flytune.errors import require
 
 
-def check_tensorboard() -> None:
-    """Refuse to go on without the package, before anything is written.
-
-    Raises:
-        BadInput: the extra `tensorboard` is not installed.
-    """
-    require("tensorboard", "tensorboard")
-
-
-class EventLog:
+class EventLog(contextlib.AbstractContextManager["EventLog"]):
     """An event file in a run directory; one scalar per number of a row, over environment steps.
 
-    A resumed run starts another file, which tells TensorBoard to forget the files before it and says the rows of the
-    checkpoint again: no row is seen twice, and none that came after the checkpoint and was flown again.
+    A resumed run starts another file, which makes TensorBoard forget the files before it and repeats the rows of the
+    checkpoint: no row is seen twice, and none that came after the checkpoint and was trained again.
     """
 
     def __init__(self, directory: Path, rows: Sequence[dict[str, Any]] = ()) -> None:
@@ -32,7 +24,7 @@ class EventLog:
         Raises:
             BadInput: the extra `tensorboard` is not installed.
         """
-        check_tensorboard()
+        require("tensorboard", "tensorboard")
         self._events: Any = require("tensorboard.compat.proto.event_pb2", "tensorboard")
         records = require("tensorboard.summary.writer.record_writer", "tensorboard")
         number = len(list(directory.glob("events.out.tfevents.*"))) + 1
@@ -57,9 +49,6 @@ class EventLog:
     def close(self) -> None:
         """Close the file."""
         self._file.close()
-
-    def __enter__(self) -> Self:
-        return self
 
     def __exit__(self, *_: object) -> None:
         self.close()

@@ -1,7 +1,7 @@
 """Trainers: the ways to learn a policy, and the one list of them.
 
-A new trainer is a module that offers the functions of `Algorithm`, and one entry of `TRAINERS`. This module imports no
-JAX, so that the command line names the trainers without waiting for it.
+A new trainer is a module and one entry of `TRAINERS`. This module imports no JAX, so that the command line names the
+trainers without waiting for it.
 """
 
 from __future__ import annotations
@@ -9,10 +9,10 @@ from __future__ import annotations
 import dataclasses
 import json
 from importlib import import_module
-from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Any
 
 from flytune.errors import BadInput, require
-from flytune.runs.shipped import DEFAULT_TRAINER
+from flytune.runs.shipped import DEFAULT_TRAINER as DEFAULT_TRAINER
 
 if TYPE_CHECKING:
     from jax import Array
@@ -21,66 +21,24 @@ if TYPE_CHECKING:
     from flytune.task.task import Task
     from flytune.task.training_settings import TrainerSettings
 
-__all__ = [
-    "DEFAULT_TRAINER",
-    "TRAINERS",
-    "Algorithm",
-    "Trainer",
-    "find_trainer",
-    "other_settings_fields",
-    "trainer_names",
-]
-
-
-@runtime_checkable
-class Algorithm(Protocol):
-    """The functions of a trainer's module. They are pure; `TrainState` is a JAX pytree of the module's own."""
-
-    def start(self, task: Task, settings: Any, key: Array) -> Any:
-        """The training state before the first update."""
-        ...
-
-    def update(self, task: Task, settings: Any, train_state: Any) -> tuple[Any, dict[str, Any]]:
-        """The training state after one update, and its metrics: `rollout_metrics` and the losses."""
-        ...
-
-    def policy(self, settings: Any, train_state: Any) -> Policy:
-        """The policy that is flown."""
-        ...
-
-    def last_policy(self, settings: Any, train_state: Any) -> Policy:
-        """The policy of the last update."""
-        ...
-
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Trainer:
     """A way to learn a policy.
 
-    Args:
-        name: as in `--trainer`.
-        summary: one line for help texts.
-        module: offers the functions of `Algorithm`, and `warm_start(settings, train_state, policy)` where supported.
-        settings_field: the field of the task that holds the settings, see `TrainerSettings`.
-        extra: the extra of flytune that brings `packages`.
-        packages: optional packages that the trainer needs; run.json records their versions.
-        missing_settings: settings that the trainer lacks, which must therefore have their default values.
-        supports_warm_start: whether a training can start from the weights of a policy.
+    Its module offers the pure functions `start(task, settings, key)`, `update(task, settings, train_state)`,
+    `policy(settings, train_state)`, `last_policy(settings, train_state)`, and where it is supported
+    `warm_start(settings, train_state, policy)`. The training state is a JAX pytree of the module's own.
     """
 
     name: str
-    summary: str
+    summary: str  # one line for help texts
     module: str
-    settings_field: str
-    extra: str = ""
-    packages: tuple[str, ...] = ()
-    missing_settings: tuple[str, ...] = ()
-    supports_warm_start: bool = False
-
-    @property
-    def trains_every_task(self) -> bool:
-        """Whether no setting of a task is refused."""
-        return not self.missing_settings
+    settings_field: str  # the field of the task that holds the settings, see `TrainerSettings`
+    extra: str = ""  # the extra of flytune that brings `packages`
+    packages: tuple[str, ...] = ()  # optional packages that the trainer needs; run.json records their versions
+    missing_settings: tuple[str, ...] = ()  # that the trainer lacks, which must therefore have their default values
+    supports_warm_start: bool = False  # whether a training can start from the weights of a policy
 
     def settings(self, task: Task) -> TrainerSettings:
         """The settings of this trainer in a task."""
@@ -121,11 +79,14 @@ class Trainer:
         return self._algorithm().start(task, self.settings(task), key)
 
     def update(self, task: Task, train_state: Any) -> tuple[Any, dict[str, Any]]:
-        """The training state after one update, and what the update measured. The state before may not be used again."""
+        """The training state after one update, and its metrics: `rollout_metrics` and the losses.
+
+        The state before may not be used again.
+        """
         return self._algorithm().update(task, self.settings(task), train_state)
 
     def policy(self, task: Task, train_state: Any) -> Policy:
-        """The policy that is flown."""
+        """The policy of the training: for PPO, of the moving average of the weights."""
         return self._algorithm().policy(self.settings(task), train_state)
 
     def last_policy(self, task: Task, train_state: Any) -> Policy:
@@ -133,14 +94,13 @@ class Trainer:
         return self._algorithm().last_policy(self.settings(task), train_state)
 
     def warm_start(self, task: Task, train_state: Any, policy: Policy) -> Any:
-        """The training state before the first update, with an actor that flies as `policy` does.
+        """The training state before the first update, with an actor that gives the actions of `policy`.
 
         Raises:
             BadInput: see `check_warm_start`.
         """
         self.check_warm_start(task, policy)
-        algorithm: Any = self._algorithm()
-        return algorithm.warm_start(self.settings(task), train_state, policy)
+        return self._algorithm().warm_start(self.settings(task), train_state, policy)
 
     def check_warm_start(self, task: Task, policy: Policy) -> None:
         """Refuse a warm start that is not possible, before anything is written.
@@ -161,8 +121,8 @@ class Trainer:
                 f"Allowed: layers {allowed} and squash {own.squash}, as trainer {self.name} makes them for this task."
             )
 
-    def _algorithm(self) -> Algorithm:
-        return import_module(self.module)  # pyright: ignore[reportReturnType]
+    def _algorithm(self) -> Any:
+        return import_module(self.module)
 
 
 TRAINERS = {
@@ -199,7 +159,7 @@ def trainer_names(*, every_task: bool = False, warm_start: bool = False) -> tupl
     return tuple(
         name
         for name, trainer in TRAINERS.items()
-        if (trainer.trains_every_task or not every_task) and (trainer.supports_warm_start or not warm_start)
+        if not (every_task and trainer.missing_settings) and (trainer.supports_warm_start or not warm_start)
     )
 
 

@@ -1,4 +1,4 @@
-"""The inspection of an ONNX file before any part of it is run.
+"""The conventions of a policy in ONNX, and the inspection of a file before any part of it is run.
 
 A model may come from an untrusted source. It may name other files for its weights, loop without end, or draw random
 numbers. A policy needs none of these, so only arithmetic that is known to be harmless is allowed.
@@ -10,10 +10,12 @@ from typing import Any
 
 import numpy as np
 
+from flytune.control.policy import CONVENTIONS
 from flytune.errors import BadInput, require
-from flytune.export.untrusted.onnx_session import CONVENTIONS, INPUT, OUTPUT
 from flytune.task.observation import SIZE
 
+INPUT, OUTPUT = "observation", "action"
+FORMAT, VERSION = "format", "flytune_version"  # metadata entries that say which program wrote the file
 # fmt: off
 OPERATORS = {
     "Abs", "Add", "And", "BatchNormalization", "Cast", "Ceil", "Celu", "Clip", "Concat", "Constant", "Cos", "Div",
@@ -69,21 +71,18 @@ def first_line(error: Exception) -> str:
     return text if len(text) <= 150 else f"{text[:150]}..."
 
 
-def _messages(message: Any) -> Iterator[Any]:
-    """A protobuf message and all messages inside it, in any field."""
-    yield message
+def _messages(kind: type, message: Any) -> Iterator[Any]:
+    """A protobuf message and all messages inside it, in any field, as far as they are of a kind."""
+    if isinstance(message, kind):
+        yield message
     for field, value in message.ListFields():
         if field.message_type is not None:
             for child in [value] if hasattr(value, "ListFields") else value:
-                yield from _messages(child)
-
-
-def _tensors(onnx: Any, model: Any) -> Iterator[Any]:
-    return (message for message in _messages(model) if isinstance(message, onnx.TensorProto))
+                yield from _messages(kind, child)
 
 
 def _refuse_other_files(onnx: Any, model: Any, where: str) -> None:
-    for tensor in _tensors(onnx, model):
+    for tensor in _messages(onnx.TensorProto, model):
         if tensor.external_data or tensor.data_location == onnx.TensorProto.EXTERNAL:
             raise BadInput(
                 f"{where}: tensor {_shown(tensor.name)} is kept in another file. "
@@ -97,7 +96,7 @@ def _refuse_more_than_arithmetic(onnx: Any, model: Any, where: str) -> None:
             f"{where}: contains functions, training information or sparse weights. "
             "Allowed: one graph of standard operators. Export it for inference, with functions inlined."
         )
-    for node in (message for message in _messages(model) if isinstance(message, onnx.NodeProto)):
+    for node in _messages(onnx.NodeProto, model):
         if node.domain not in ("", "ai.onnx") or node.op_type not in OPERATORS:
             name = f"{node.domain}::{node.op_type}" if node.domain else node.op_type
             raise BadInput(
@@ -114,11 +113,11 @@ def _refuse_other_inputs_and_outputs(onnx: Any, graph: Any, where: str) -> None:
         if [value.name for value in found] != [name]:
             names = ", ".join(_shown(value.name) for value in found) or "none"
             raise BadInput(f"{where}: has the {kind}s {names}. {wanted}")
-        kind_of_number = found[0].type.tensor_type.elem_type
-        if kind_of_number != onnx.TensorProto.FLOAT:
-            shown = onnx.TensorProto.DataType.Name(kind_of_number) if kind_of_number in range(1, 17) else "unknown"
+        tensor = found[0].type.tensor_type
+        if tensor.elem_type != onnx.TensorProto.FLOAT:
+            shown = onnx.TensorProto.DataType.Name(tensor.elem_type) if tensor.elem_type in range(1, 17) else "unknown"
             raise BadInput(f"{where}: {kind} {name!r} is of type {shown}. {wanted}")
-        shape = [size.dim_value or size.dim_param or "?" for size in found[0].type.tensor_type.shape.dim]
+        shape = [size.dim_value or size.dim_param or "?" for size in tensor.shape.dim]
         if len(shape) != 2 or shape[1] != size:
             raise BadInput(f"{where}: {kind} {name!r} has shape {_shown(shape)}. {wanted}")
         if isinstance(shape[0], int):
@@ -141,6 +140,7 @@ def _refuse_other_conventions(model: Any, where: str) -> None:
     if not all(isinstance(text, str) for entry in model.metadata_props for text in (entry.key, entry.value)):
         raise BadInput(f"{where}: has damaged metadata (bytes that are not UTF-8). Export it again.")
     found = metadata(model)
+    # a graph does not say what its numbers mean: a model without these entries in its metadata is refused
     for key, wanted in CONVENTIONS.items():
         if found.get(key) != wanted:
             has = f"is {_shown(found[key])}" if key in found else "is missing"
@@ -152,7 +152,7 @@ def _refuse_other_conventions(model: Any, where: str) -> None:
 
 def _refuse_broken_numbers(onnx: Any, model: Any, where: str) -> None:
     allowed = {getattr(onnx.TensorProto, name) for name in NUMBERS}
-    for tensor in _tensors(onnx, model):
+    for tensor in _messages(onnx.TensorProto, model):
         if tensor.data_type not in allowed:
             raise BadInput(
                 f"{where}: tensor {_shown(tensor.name)} has a type that is not allowed. Allowed: {', '.join(NUMBERS)}."
@@ -163,7 +163,7 @@ def _refuse_broken_numbers(onnx: Any, model: Any, where: str) -> None:
             shown = f"{_shown(tensor.name)} is damaged ({first_line(error)})"
             raise BadInput(f"{where}: tensor {shown}. Export it again.") from None
         _refuse_not_finite(values, f"tensor {_shown(tensor.name)}", where)
-    for attribute in (message for message in _messages(model) if isinstance(message, onnx.AttributeProto)):
+    for attribute in _messages(onnx.AttributeProto, model):
         _refuse_not_finite(np.array([attribute.f, *attribute.floats]), f"attribute {_shown(attribute.name)}", where)
 
 

@@ -51,8 +51,7 @@ def load_sb3(path: Path) -> Policy:
     except Exception as error:
         reason = " ".join(str(error).split())[:200] or type(error).__name__
         raise BadInput(f"{path}: is not a Stable-Baselines3 model ({reason}). {REMEDY}") from None
-    problem = _unknown_kind(about) or _unknown_shape(tensors) or _not_finite(tensors)
-    if problem:
+    if problem := _unknown_kind(about) or _unknown_shape(tensors) or _not_finite(tensors):
         raise BadInput(f"{path}: {problem} {REMEDY}")
     return Policy(
         actor=actor_network(tensors),
