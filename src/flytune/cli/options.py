@@ -20,7 +20,7 @@ CONTROLLER_HELP = (
 
 
 def whole_number(kind: type, tokens: Sequence[Token]) -> int:
-    """The whole number that was typed; digits alone, so that 3.7 is refused and not rounded."""
+    """The whole number that was typed; 3.7 is refused and not rounded."""
     try:
         return int(tokens[0].value)
     except ValueError:
@@ -51,7 +51,6 @@ Assignments = Annotated[
     tuple[str, ...], Parameter(metavar="PATH=VALUE", consume_multiple=(1, None), negative=(), show_default=False)
 ]
 Folder = Annotated[Path | None, Parameter(name="--out", metavar="DIR")]
-Steps = Annotated[Whole | None, Parameter(help="number of environment steps in all (default: the task's own)")]
 Edits = Annotated[Assignments, Parameter(name="--set")]
 AsJson = Annotated[Flag, Parameter(name="--json", help="print one JSON object instead of the table")]
 
@@ -91,14 +90,10 @@ class FlightOptions:
 
     def settings(self) -> dict[str, Any]:
         """The keyword arguments of `flytune.evaluate`."""
-        return {
-            "trials": self.trials,
-            "seed": self.seed,
-            "duration": self.duration,
-            "initial_conditions": self.initial_conditions,
-            "simulator": self.simulator,
-            "simulator_options": assignments(self.simulator_options),
-        }
+        return vars(self) | {"simulator_options": assignments(self.simulator_options)}
+
+
+FLIGHT_DEFAULTS = FlightOptions()
 
 
 def assignments(texts: Sequence[str]) -> dict[str, Any]:
