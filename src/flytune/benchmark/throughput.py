@@ -1,4 +1,4 @@
-"""Throughput on this machine. The ratios matter: they are measured in one run, and depend less on the machine."""
+"""Throughput on this machine, and ratios of it, which are measured in one run and depend less on the machine."""
 
 import dataclasses
 import itertools
@@ -9,13 +9,8 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from flytune.benchmark.baselines import (
-    Measurement,
-    compare_simulation,
-    compare_training,
-    fastest,
-    measurements_table,
-)
+from flytune.benchmark import baselines
+from flytune.benchmark.baselines import Measurement, fastest
 from flytune.errors import BadInput
 from flytune.simulation.environment import Episode
 from flytune.simulation.rollout import Draw, reset_all, rollout
@@ -65,7 +60,7 @@ class Throughput:
         for title, measurements in (("training", self.training), ("simulation", self.simulation)):
             if measurements is not None:
                 heading = f"{title} (steps of each environment; ratio to the first row)"
-                lines += ["", heading, str(measurements_table(measurements))]
+                lines += ["", heading, str(baselines.measurements_table(measurements))]
         return "\n".join(lines)
 
 
@@ -94,8 +89,8 @@ def bench(what: str = "all") -> Throughput:
         ppo_share_of_limit=ppo_rate * operations_per_step(task.ppo) / product if ppo_rate else None,
         apg=task.apg.steps_per_update / _seconds(_training(TRAINERS["apg"], task)) if training else None,
         simulate=SIMULATED[0] * SIMULATED[1] / _seconds(fly) if simulation else None,
-        training=compare_training(task, ppo_update) if training else None,
-        simulation=compare_simulation(task, fly, SIMULATED) if simulation else None,
+        training=baselines.compare_training(task, ppo_update) if training else None,
+        simulation=baselines.compare_simulation(task, fly, SIMULATED) if simulation else None,
         device=jax.devices()[0].platform,
         cores=os.cpu_count(),
     )
