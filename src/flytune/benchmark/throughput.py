@@ -67,13 +67,11 @@ class Throughput:
 def bench(what: str = "all") -> Throughput:
     """The throughput of training and of simulation, beside a matrix product, Stable-Baselines3 and PyBullet.
 
-    Packages that are not installed are left out and named. Everything takes a few minutes.
-
-    Args:
-        what: `train`, `simulate` or `all`.
+    `what` is `train`, `simulate` or `all`, which takes a few minutes. Packages that are not installed are left out and
+    named.
 
     Raises:
-        BadInput: something else.
+        BadInput: `what` is something else.
     """
     if what not in PARTS:
         raise BadInput(f"what: {what!r} is not allowed. Allowed: {', '.join(PARTS)}.")

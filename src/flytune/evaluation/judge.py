@@ -136,9 +136,8 @@ def judge(flights: Flights) -> Judgement:
     disappears; it is then not among the small steps. An unsettled trial that did not crash keeps its measured
     overshoot and errors.
 
-    In the secondary bands every trial counts, with the band its own step gives (for yaw the wrapped error at the
-    start): a tiny step asks for a tiny band, which sensor noise alone may break, and a step of 0 for exactly no
-    error.
+    In the secondary bands every trial counts, with a band in proportion to its own step (for yaw the wrapped error at
+    the start): a tiny step has a tiny band, which sensor noise alone may leave.
 
     Source: docs, definitions; C5 of the paper's open points for the bands.
     """

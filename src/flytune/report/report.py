@@ -30,13 +30,9 @@ SAME_PLACE = 1e-4  # m; another simulator may round the start, which is metres a
 def write_report(path: Path, evaluations: Sequence[Evaluation], comparison: Comparison | None = None) -> None:
     """Write the report of one or several controllers as one HTML file, whole or not at all.
 
-    Several controllers are compared first, then each has its section.
-
-    Args:
-        path: the file; one that is there is replaced.
-        evaluations: the controllers, 1 or more, in the order of the page.
-        comparison: of their judgements, in the same order. Where None, controllers that flew the same trials are
-            compared with the first one; for others, the page says why there are no paired differences.
+    Several controllers are compared first, then each has its section. `comparison` is that of their judgements, in the
+    same order. Where None, controllers that flew the same trials are compared with the first one; for others, the page
+    says why there are no paired differences.
 
     Raises:
         BadInput: no controller, a comparison of other controllers or other trials, or the file cannot be written.

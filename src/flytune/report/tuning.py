@@ -1,4 +1,4 @@
-"""The page of a tuning: what was required and reached, the response of the result, and the reason of each edit."""
+"""The page of a tuning: the requirement and the response that was reached, and the reason of each edit."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -16,12 +16,9 @@ from flytune.tables import NULL, Cell, Column, Table, number
 
 
 def write_tuning(path: Path, tuning: Mapping[str, Any], evaluation: Evaluation | None = None) -> None:
-    """Write the page of a tuning, whole or not at all.
+    """Write the page of a tuning (`Tuning.to_dict`), whole or not at all.
 
-    Args:
-        path: the file.
-        tuning: the plain values of a tuning, `Tuning.to_dict`.
-        evaluation: the best policy on its last validation set; it is flown again where None.
+    `evaluation` is that of the best policy on its last validation set; the policy flies again where None.
 
     Raises:
         BadInput: the file cannot be written, or the best policy cannot be read.

@@ -55,10 +55,9 @@ jax.tree_util.register_pytree_node(FoundController, lambda found: ((found.contro
 def find_controller(name: str, task: str | Task | None = None) -> FoundController:
     """The controller that a run directory, a policy file or the name of a classical controller stands for.
 
-    Args:
-        name: `runs/baseline-apg-s0`, `policy.safetensors`, `policy.onnx`, a Stable-Baselines3 model `model.zip`,
-            `pid`, `geometric` or `lqr` (gains tuned by search; `pid@textbook` for those of the books).
-        task: the task to fly, a preset, a TOML file or a task; where None, that of its training, or the baseline.
+    A policy file is one of flytune, ONNX or a Stable-Baselines3 model `model.zip`; classical controllers are `pid`,
+    `geometric` and `lqr` (gains tuned by search; `pid@textbook` for those of the books). `task` is the task to fly, a
+    preset, a TOML file or a task; where None, that of the controller's training, or the baseline.
 
     Raises:
         BadInput: no controller has this name, or it cannot be used.
