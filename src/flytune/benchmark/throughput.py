@@ -53,10 +53,11 @@ class Throughput:
                 f"train ppo (128 environments x 128 steps)   {self.ppo:10,.0f} steps/s   "
                 f"{self.ppo_share_of_limit:.2f} of the product's limit"
             )
-        if self.apg is not None:
-            lines.append(f"train apg (forward and backward)           {self.apg:10,.0f} steps/s")
-        if self.simulate is not None:
-            lines.append(f"simulate (observe, step, reward, reset)    {self.simulate:10,.0f} steps/s")
+        others = {
+            "train apg (forward and backward)": self.apg,
+            "simulate (observe, step, reward, reset)": self.simulate,
+        }
+        lines += [f"{what:42} {rate:10,.0f} steps/s" for what, rate in others.items() if rate is not None]
         for title, measurements in (("training", self.training), ("simulation", self.simulation)):
             if measurements is not None:
                 heading = f"{title} (steps of each environment; ratio to the first row)"

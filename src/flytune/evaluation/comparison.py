@@ -43,7 +43,7 @@ class Comparison:
 
     def table(self) -> str:
         """The comparison for a terminal: a row per controller, then the differences in words."""
-        return comparison_text(self.judgements, self.reference, self.differences)
+        return comparison_text(self)
 
     __str__ = table
 

@@ -1,13 +1,17 @@
-"""The comparison in tables and words: a row per controller, a row per metric, and sentences on what sets them apart."""
+"""The comparison in tables and words: a row per controller, a row per metric, and sentences on their differences."""
 
 import math
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from flytune.evaluation.difference import METRICS, Difference
 from flytune.evaluation.judge import CHANNELS, Judgement
 from flytune.tables import NULL, Cell, Column, Table
+
+if TYPE_CHECKING:
+    from flytune.evaluation.comparison import Comparison
 
 LABELS = {"simulator": "world"}  # of fields whose name in the output is older than their name in the code
 MAY_DIFFER = ("simulator", "task", "vehicle")  # between controllers whose trials are the same
@@ -54,22 +58,22 @@ def _row(number: int, judgement: Judgement) -> dict:
     }
 
 
-def comparison_text(judgements: Sequence[Judgement], reference: int, differences: Sequence[Difference]) -> str:
-    """The comparison for a terminal: the table, and beneath it what sets each controller apart from the reference."""
-    lines = [conditions(judgements), "", comparison_table(judgements).text()]
-    for found in sentences(judgements, reference, differences):
-        lines += ["", found[0], *(f"    {text}" for text in found[1:])]
+def comparison_text(comparison: "Comparison") -> str:
+    """The comparison for a terminal: the table, and beneath it how each controller differs from the reference."""
+    lines = [conditions(comparison), "", comparison_table(comparison.judgements).text()]
+    for first, *others in sentences(comparison):
+        lines += ["", first, *(f"    {text}" for text in others)]
     return "\n".join([*lines, "", *NOTE])
 
 
-def differences_table(judgements: Sequence[Judgement], reference: int, differences: Sequence[Difference]) -> Table:
+def differences_table(comparison: "Comparison") -> Table:
     """Per metric and controller but the reference: the median difference, its interval, and the trials."""
-    names = [judgement.name for judgement in judgements]
+    names, reference = comparison.names, comparison.reference
     others = [f"{number} {name}" for number, name in enumerate(names, start=1) if number != reference + 1]
     rows = []
     for metric in METRICS:
         unit, scale = metric.shown
-        found = (_difference_cell(one, scale) for one in differences if one.metric is metric)
+        found = (_difference_cell(one, scale) for one in comparison.differences if one.metric is metric)
         rows.append((f"{metric.title} [{unit}]", *found))
     return Table.plain([f"less {names[reference]}", *others], rows, style="dense narrow")
 
@@ -93,8 +97,9 @@ def controller_cell(number: int, name: str) -> Cell:
     return Cell(text=_short(name), page=name, badge=number)
 
 
-def conditions(judgements: Sequence[Judgement]) -> str:
-    """What all controllers have in common, and for the rest what each of them flew, in one line."""
+def conditions(comparison: "Comparison") -> str:
+    """The conditions that all controllers share, and those in which they differ, in one line."""
+    judgements = comparison.judgements
     first = judgements[0]
     trials = "the same trial" if first.trials == 1 else f"the same {first.trials} trials"
     text = [
@@ -109,15 +114,15 @@ def conditions(judgements: Sequence[Judgement]) -> str:
     return "; ".join(text)
 
 
-def sentences(judgements: Sequence[Judgement], reference: int, differences: Sequence[Difference]) -> list[list[str]]:
+def sentences(comparison: "Comparison") -> list[list[str]]:
     """How each controller differs from the reference, a clause for each metric that has a verb.
 
     The first clause of a controller is whole; the others leave out both names.
     """
-    against = _short(judgements[reference].name)
-    spoken = [difference for difference in differences if difference.metric.verb]
-    found = [[one for one in spoken if one.name == judgement.name] for judgement in judgements]
-    return [[_clause(one, against, whole=one is told[0]) for one in told] for told in found if told]
+    against = _short(comparison.names[comparison.reference])
+    spoken = [difference for difference in comparison.differences if difference.metric.verb]
+    found = [[one for one in spoken if one.name == name] for name in comparison.names]
+    return [[_clause(one, against, whole=one is clauses[0]) for one in clauses] for clauses in found if clauses]
 
 
 def _clause(difference: Difference, against: str, whole: bool) -> str:

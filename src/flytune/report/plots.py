@@ -134,12 +134,13 @@ def _trial(
 
 def _settled_dot(flights: Flights, judgement: Judgement, values: np.ndarray, trial: int, axis: str) -> go.Scatter:
     """A dot on the curve at the settling time; invisible where the trial did not settle."""
-    instant = judgement.settling_time[axis][trial]
-    settled = np.isfinite(instant)
-    sample = int(np.argmin(np.abs(flights.time - instant))) if settled else 0
+    instant = float(judgement.settling_time[axis][trial])
+    x = y = None
+    if math.isfinite(instant):
+        x, y = instant, float(values[trial, np.argmin(np.abs(flights.time - instant))])
     return go.Scatter(
-        x=[float(instant) if settled else None],
-        y=[float(values[trial, sample]) if settled else None],
+        x=[x],
+        y=[y],
         mode="markers",
         marker={"color": style.TRIALS[trial], "size": 6, "line": {"color": "white", "width": 1}},
         name=f"trial {trial + 1}",

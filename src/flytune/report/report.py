@@ -114,14 +114,13 @@ def _comparison(evaluations: Sequence[Evaluation], comparison: Comparison | None
     if comparison is None:
         unknown = ("conditions", "sentences", "reference", "responses", "boxes", "differences")
         return {**shown, "paired": different, **dict.fromkeys(unknown)}
-    compared = (judgements, comparison.reference, comparison.differences)
     return {
         **shown,
-        "conditions": conditions(judgements),
-        "sentences": sentences(*compared),
+        "conditions": conditions(comparison),
+        "sentences": sentences(comparison),
         "reference": controller_cell(comparison.reference + 1, comparison.names[comparison.reference]),
         "paired": comparison_plots.paired(comparison),
         "responses": comparison_plots.responses([one.flights for one in evaluations], comparison),
         "boxes": comparison_plots.boxes(comparison),
-        "differences": differences_table(*compared),
+        "differences": differences_table(comparison),
     }
