@@ -1,10 +1,10 @@
 """One model of a table, written as text for a terminal, as HTML for a page and as Markdown.
 
-A table is columns and rows. A simple one is built from titles and texts; each column is as wide as its longest text:
+A simple table is built from titles and texts; each column is as wide as its longest text:
 
     Table.plain(("rule", "when"), [("H1", "too slow"), ("H2", "overshoots")])
 
-Tables of numbers say how each column is computed from a record, so that a new column is one more line in one place:
+A table of numbers says how each column is computed from a record:
 
     Table.of([Column("settling [s]", lambda judged: judged["settling_time"]["median"], decimals=2)], judgements)
 
@@ -36,7 +36,7 @@ Value = str | int | float | None | Cell
 
 @dataclasses.dataclass(frozen=True)
 class Column:
-    """What a column is called, how it is computed and how it is written.
+    """The heading of a column, how its cells are computed and how they are written.
 
     Args:
         title: the heading; with a `group` the second line of it.
@@ -86,7 +86,7 @@ class Table:
 
     @classmethod
     def plain(cls, titles: Sequence[str | Column], rows: Iterable[Sequence[Value]], **options: Any) -> "Table":
-        """A table of rows that are there already; a title stands for a left-aligned column."""
+        """A table of given rows; a title stands for a left-aligned column."""
         columns = tuple(title if isinstance(title, Column) else Column(title, align="left") for title in titles)
         cells = tuple(tuple(column.write(value) for column, value in zip(columns, row, strict=True)) for row in rows)
         return cls(columns=columns, rows=cells, **options)
@@ -100,12 +100,10 @@ class Table:
 
     def text(self) -> str:
         """The table for a terminal, in lines of plain text."""
-        columns = list(zip(*self.rows, strict=True)) or [()] * len(self.columns)
-        longest = [
-            max([len(column.title), *(len(cell.text) for cell in cells)])
-            for column, cells in zip(self.columns, columns, strict=True)
+        widths = [
+            max([column.width or 0, len(column.title), *(len(row[index].text) for row in self.rows)])
+            for index, column in enumerate(self.columns)
         ]
-        widths = [max(column.width or 0, most) for column, most in zip(self.columns, longest, strict=True)]
         gaps = ["  " if index and column.width is None else "" for index, column in enumerate(self.columns)]
 
         def line(texts: Iterable[str]) -> str:
@@ -128,16 +126,17 @@ class Table:
         grouped = any(column.group for column in self.columns)
         upper, lower = [], []
         for group, columns in self.groups:
-            if not group or not any(column.title for column in columns):
-                heading = group.strip() or columns[0].title.strip()
-                upper.append(_heading(heading, columns[0], f' rowspan="2" colspan="{len(columns)}"' if grouped else ""))
-                continue
-            upper.append(f'<th colspan="{len(columns)}">{escape(group.strip())}</th>')
-            lower += [_heading(column.title.strip(), column) for column in columns]
+            span = f' colspan="{len(columns)}"'
+            if group and any(column.title for column in columns):
+                upper.append(f"<th{span}>{escape(group.strip())}</th>")
+                lower += [_heading(column.title, column) for column in columns]
+            else:
+                rows = f' rowspan="2"{span}' if grouped else ""
+                upper.append(_heading(group.strip() or columns[0].title, columns[0], rows))
         head = "".join(f"<tr>{''.join(row)}</tr>" for row in (upper, lower) if row)
         body = []
         for first, *others in self.rows:
-            cells = (f"<td{_aligned(c)}>{_html(cell)}</td>" for c, cell in zip(self.columns[1:], others, strict=True))
+            cells = (f"<td{_class(c)}>{_html(cell)}</td>" for c, cell in zip(self.columns[1:], others, strict=True))
             body.append(f'<tr><th scope="row">{_html(first)}</th>{"".join(cells)}</tr>')
         return (
             f'<div class="wide"><table class="{self.style}"><thead>{head}</thead>'
@@ -148,14 +147,15 @@ class Table:
 
     def markdown(self) -> str:
         """The table in Markdown."""
-        head = [f"{column.group.strip()} {column.title.strip()}".strip() for column in self.columns]
+        head = [f"{column.group.strip()} {column.title.strip()}" for column in self.columns]
         lines = ["---" if column.align == "left" else "--:" for column in self.columns]
         rows = [[f"**{cell.text}**" if cell.tone else cell.text for cell in row] for row in self.rows]
-        return "\n".join(f"| {' | '.join(_one_line(cell) for cell in row)} |" for row in (head, lines, *rows))
+        texts = ([text.strip().replace("|", "/").replace("\n", ", ") for text in row] for row in (head, lines, *rows))
+        return "\n".join(f"| {' | '.join(row)} |" for row in texts)
 
 
 def number(value: float | None, decimals: int, scale: float = 1.0) -> str:
-    """A number as every table writes it; '-' where there is none, or it is infinite."""
+    """A number as text; '-' where there is none, or it is infinite."""
     return NULL if value is None or not math.isfinite(value) else f"{value * scale:.{decimals}f}"
 
 
@@ -163,12 +163,12 @@ def _pad(text: str, width: int, align: str) -> str:
     return text.rjust(width) if align == "right" else text.ljust(width)
 
 
-def _aligned(column: Column) -> str:
+def _class(column: Column) -> str:
     return ' class="words"' if column.align == "left" else ""
 
 
 def _heading(text: str, column: Column, span: str = "") -> str:
-    return f"<th{_aligned(column)}{span}>{escape(text)}</th>"
+    return f"<th{_class(column)}{span}>{escape(text.strip())}</th>"
 
 
 def _html(cell: Cell) -> str:
@@ -176,7 +176,3 @@ def _html(cell: Cell) -> str:
     if cell.tone:
         text = f'<span class="{escape(cell.tone)}">{text}</span>'
     return text if cell.badge is None else f'<b class="badge c{(cell.badge - 1) % 10}">{cell.badge}</b>{text}'
-
-
-def _one_line(text: str) -> str:
-    return text.strip().replace("|", "/").replace("\n", ", ")

@@ -4,6 +4,7 @@ import subprocess
 import sys
 from importlib import metadata
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -26,9 +27,12 @@ OPTIONS = {
 
 
 def parsed(*words):
-    """What a command is called with."""
+    """The command, its arguments and its options."""
     command, bound, _ = make_app().parse_args(list(words), exit_on_error=False, print_error=False)
-    return command.__name__, bound.args, bound.kwargs.get("options")
+    bound.apply_defaults()
+    options = dict(bound.kwargs)
+    shared = vars(options.pop("options")) if "options" in options else {}
+    return command.__name__, bound.args, SimpleNamespace(**shared, **options)
 
 
 def test_flytune_alone_prints_the_help_and_ends_well(capsys):
@@ -108,14 +112,14 @@ def test_every_option_arrives_with_its_type():
 def test_a_bare_tuning_asks_for_what_the_help_says():
     *_, options = parsed("tune", "--settling-time", "2.5")
     assert (options.settling_time, options.tolerance, options.overshoot, options.error) == (2.5, 10.0, 5.0, None)
-    assert (options.axis, options.percentile, options.trainer, options.iterations, options.seed) == (
+    assert (options.axis, options.percentile, options.trainer, options.most_iterations, options.seed) == (
         "position", 50.0, "apg", 12, 0,
     )  # fmt: skip
 
 
 def test_the_iterations_of_a_tuning_may_be_called_steps():
     *_, options = parsed("tune", "--settling-time", "2.5", "--steps", "3")
-    assert options.iterations == 3
+    assert options.most_iterations == 3
 
 
 REFUSED = {

@@ -10,7 +10,7 @@ from tests.pages import HOSTILE, Reader
 
 from flytune.errors import BadInput
 from flytune.evaluation.comparison import compare
-from flytune.evaluation.comparison_table import signed, unit
+from flytune.evaluation.comparison_table import signed
 from flytune.evaluation.difference import METRICS
 from flytune.report import comparison_plots
 from flytune.report.report import write_report
@@ -102,7 +102,7 @@ def test_the_dots_stand_at_the_differences_and_the_bars_at_their_intervals(make_
     assert len(bars) == len(dots) == len(comparison.differences) == len(METRICS)
     compared = 0
     for bar, dot, difference in zip(bars, dots, comparison.differences, strict=True):
-        _, scale = unit(difference.metric)
+        _, scale = difference.metric.shown
         if math.isfinite(difference.low + difference.median + difference.high):
             compared += 1
             assert bar.x == pytest.approx((difference.low * scale, difference.high * scale))

@@ -43,7 +43,7 @@ def test_the_share_of_settled_trials_ends_at_those_that_settled(make_evaluation,
     position[:3] = flights.target_position  # three of twelve are there from the start
     position[3:, :, 0] = 1.0
     evaluation = make_evaluation(position=position, crashed=np.zeros(flights.trials, dtype=bool))
-    line = plots.settled_share([("a", evaluation.judgement)]).data[0]
+    line = plots.settled_share([evaluation.judgement]).data[0]
     assert line.y[-1] == pytest.approx(25)
     assert line.x[-1] == pytest.approx(evaluation.judgement.duration)
 

@@ -13,9 +13,8 @@ from flytune.task.task import load_task
 
 
 def case(what, run=lambda: None, extras=()):
-    return baselines.Case(
-        what=what, environments=4, steps=1024, extras=extras, prepare=lambda: contextlib.nullcontext(run)
-    )
+    measurement = baselines.Measurement(what=what, environments=4, steps=1024)
+    return baselines.Case(measurement, lambda: contextlib.nullcontext(run), extras)
 
 
 @pytest.mark.parametrize(("package", "extras"), [("pybullet", ("pybullet", "sb3")), ("stable_baselines3", ("sb3",))])

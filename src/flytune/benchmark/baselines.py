@@ -35,22 +35,19 @@ class Measurement:
     what: str
     environments: int
     steps: int  # per environment in one update, or in one repetition
-    processes: int  # simulating processes
-    steps_per_second: float | None
+    processes: int = 1  # simulating processes
+    steps_per_second: float | None = None
     ratio: float | None = None
     missing: str | None = None  # the command that installs a missing package
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
+@dataclasses.dataclass(frozen=True)
 class Case:
-    """One case of a benchmark: fields as in `Measurement`, the extras it needs, and the function that prepares it."""
+    """What is to be measured, the function that prepares it, and the extras it needs."""
 
-    what: str
-    environments: int
-    steps: int
-    processes: int = 1
-    extras: tuple[str, ...] = ()
+    measurement: Measurement  # without its rate
     prepare: Callable[[], contextlib.AbstractContextManager[Repeat]]
+    extras: Sequence[str] = ()
 
 
 def measurements_table(measurements: Sequence[Measurement]) -> Table:
@@ -74,17 +71,16 @@ def compare_training(task: Task, own: Repeat) -> list[Measurement]:
     number, rollout = task.ppo.environments, task.ppo.rollout
     elsewhere, here = partial(_pybullet_processes, task), partial(_own_environments, task)
 
-    def case(what: str, environments: Environments, number: int, steps: int, **options: Any) -> Case:
-        prepare = partial(_training, task, environments, number, steps)
-        return Case(what=what, environments=number, steps=steps, prepare=prepare, **options)
+    def case(what: str, environments: Environments, number: int, steps: int, *extras: str, processes: int = 1) -> Case:
+        measurement = Measurement(what=what, environments=number, steps=steps, processes=processes)
+        return Case(measurement, partial(_training, task, environments, number, steps), extras)
 
-    both, sb3 = ("pybullet", "sb3"), ("sb3",)
     return measure(
         [
-            case("SB3 PPO on PyBullet", elsewhere, PROCESSES, ROLLOUT, processes=PROCESSES, extras=both),
-            case("SB3 PPO on flytune", here, PROCESSES, ROLLOUT, extras=sb3),
-            case("SB3 PPO on flytune", here, number, rollout, extras=sb3),
-            Case(what="flytune PPO", environments=number, steps=rollout, prepare=lambda: _ready(own)),
+            case("SB3 PPO on PyBullet", elsewhere, PROCESSES, ROLLOUT, "pybullet", "sb3", processes=PROCESSES),
+            case("SB3 PPO on flytune", here, PROCESSES, ROLLOUT, "sb3"),
+            case("SB3 PPO on flytune", here, number, rollout, "sb3"),
+            _own("flytune PPO", own, number, rollout),
         ]
     )
 
@@ -94,7 +90,8 @@ def compare_simulation(task: Task, own: Repeat, own_shape: tuple[int, int]) -> l
     width = task.ppo.environments
 
     def case(what: str, number: int, prepare: Any, *extras: str, processes: int = 1) -> Case:
-        return Case(what=what, environments=number, steps=STEPS, prepare=prepare, extras=extras, processes=processes)
+        measurement = Measurement(what=what, environments=number, steps=STEPS, processes=processes)
+        return Case(measurement, prepare, extras)
 
     processes = partial(_stepping, partial(_pybullet_processes, task), PROCESSES)
     vector = partial(_stepping, partial(_own_environments, task), width)
@@ -105,49 +102,36 @@ def compare_simulation(task: Task, own: Repeat, own_shape: tuple[int, int]) -> l
             case("PyBullet alone, no rewards", 1, partial(_alone, task), "pybullet"),
             case("flytune, Gymnasium", 1, partial(_one, task, "flytune"), "gymnasium"),
             case("flytune, VecEnv", width, vector, "sb3"),
-            Case(
-                what="flytune, compiled",
-                environments=own_shape[0],
-                steps=own_shape[1],
-                prepare=lambda: _ready(own),
-            ),
+            _own("flytune, compiled", own, *own_shape),
         ]
     )
 
 
-def measure(cases: list[Case], clock: Callable[[], float] = time.perf_counter) -> list[Measurement]:
-    """The throughput of each case in the fastest of its repetitions, and its ratio to the first case.
+def _own(what: str, run: Repeat, environments: int, steps: int) -> Case:
+    """A case of flytune that is ready to run."""
+    measurement = Measurement(what=what, environments=environments, steps=steps)
+    return Case(measurement, lambda: contextlib.nullcontext(run))
 
-    Args:
-        cases: what to measure.
-        clock: gives the time now in seconds.
-    """
+
+def measure(cases: Sequence[Case], clock: Callable[[], float] = time.perf_counter) -> list[Measurement]:
+    """The throughput of each case in the fastest of its repetitions; the clock gives the time now in seconds."""
     missing = [_missing(case.extras) for case in cases]
     with contextlib.ExitStack() as stack:
-        runs = [
-            None if lacks else stack.enter_context(case.prepare()) for case, lacks in zip(cases, missing, strict=True)
-        ]
-        shortest = fastest([run for run in runs if run is not None], clock)
-    seconds = [shortest.pop(0) if run is not None else None for run in runs]
-    rates = [
-        None if time_ is None else case.environments * case.steps / time_
-        for case, time_ in zip(cases, seconds, strict=True)
-    ]
+        runs = {
+            index: stack.enter_context(case.prepare()) for index, case in enumerate(cases) if missing[index] is None
+        }
+        seconds = dict(zip(runs, fastest(list(runs.values()), clock), strict=True))
+    measured = [case.measurement for case in cases]
+    steps = {index: measured[index].environments * measured[index].steps for index in seconds}
+    rates = {index: steps[index] / shortest for index, shortest in seconds.items()}
+    ratios = {index: rate / rates[0] for index, rate in rates.items() if 0 in rates}
     return [
-        Measurement(
-            what=case.what,
-            environments=case.environments,
-            steps=case.steps,
-            processes=case.processes,
-            steps_per_second=rate,
-            ratio=rate / rates[0] if rate and rates[0] else None,
-            missing=lacks,
-        )
-        for case, rate, lacks in zip(cases, rates, missing, strict=True)
+        dataclasses.replace(each, steps_per_second=rates.get(index), ratio=ratios.get(index), missing=missing[index])
+        for index, each in enumerate(measured)
     ]
 
 
-def _missing(extras: tuple[str, ...]) -> str | None:
+def _missing(extras: Sequence[str]) -> str | None:
     """The command that installs some extras, or None where they are installed."""
     try:
         for extra in extras:
@@ -201,11 +185,6 @@ def _own_environments(task: Task, number: int) -> Iterator[Any]:
     from flytune.adapters.vec_env import HoverVecEnv
 
     yield HoverVecEnv(task, number)
-
-
-@contextlib.contextmanager
-def _ready(run: Repeat) -> Iterator[Repeat]:
-    yield run
 
 
 @contextlib.contextmanager

@@ -1,4 +1,4 @@
-"""Throughput on this machine. The ratios matter: they are measured in one run, and depend less on the machine."""
+"""Throughput on this machine, and ratios of it, which are measured in one run and depend less on the machine."""
 
 import dataclasses
 import itertools
@@ -9,13 +9,8 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from flytune.benchmark.baselines import (
-    Measurement,
-    compare_simulation,
-    compare_training,
-    fastest,
-    measurements_table,
-)
+from flytune.benchmark import baselines
+from flytune.benchmark.baselines import Measurement, fastest
 from flytune.errors import BadInput
 from flytune.simulation.environment import Episode
 from flytune.simulation.rollout import Draw, reset_all, rollout
@@ -58,27 +53,26 @@ class Throughput:
                 f"train ppo (128 environments x 128 steps)   {self.ppo:10,.0f} steps/s   "
                 f"{self.ppo_share_of_limit:.2f} of the product's limit"
             )
-        if self.apg is not None:
-            lines.append(f"train apg (forward and backward)           {self.apg:10,.0f} steps/s")
-        if self.simulate is not None:
-            lines.append(f"simulate (observe, step, reward, reset)    {self.simulate:10,.0f} steps/s")
+        others = {
+            "train apg (forward and backward)": self.apg,
+            "simulate (observe, step, reward, reset)": self.simulate,
+        }
+        lines += [f"{what:42} {rate:10,.0f} steps/s" for what, rate in others.items() if rate is not None]
         for title, measurements in (("training", self.training), ("simulation", self.simulation)):
             if measurements is not None:
                 heading = f"{title} (steps of each environment; ratio to the first row)"
-                lines += ["", heading, str(measurements_table(measurements))]
+                lines += ["", heading, str(baselines.measurements_table(measurements))]
         return "\n".join(lines)
 
 
 def bench(what: str = "all") -> Throughput:
     """The throughput of training and of simulation, beside a matrix product, Stable-Baselines3 and PyBullet.
 
-    Packages that are not installed are left out and named. Everything takes a few minutes.
-
-    Args:
-        what: `train`, `simulate` or `all`.
+    `what` is `train`, `simulate` or `all`, which takes a few minutes. Packages that are not installed are left out and
+    named.
 
     Raises:
-        BadInput: something else.
+        BadInput: `what` is something else.
     """
     if what not in PARTS:
         raise BadInput(f"what: {what!r} is not allowed. Allowed: {', '.join(PARTS)}.")
@@ -94,8 +88,8 @@ def bench(what: str = "all") -> Throughput:
         ppo_share_of_limit=ppo_rate * operations_per_step(task.ppo) / product if ppo_rate else None,
         apg=task.apg.steps_per_update / _seconds(_training(TRAINERS["apg"], task)) if training else None,
         simulate=SIMULATED[0] * SIMULATED[1] / _seconds(fly) if simulation else None,
-        training=compare_training(task, ppo_update) if training else None,
-        simulation=compare_simulation(task, fly, SIMULATED) if simulation else None,
+        training=baselines.compare_training(task, ppo_update) if training else None,
+        simulation=baselines.compare_simulation(task, fly, SIMULATED) if simulation else None,
         device=jax.devices()[0].platform,
         cores=os.cpu_count(),
     )

@@ -3,13 +3,13 @@
 import json
 import os
 import sys
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
 from cyclopts import Parameter
 
 from flytune.cli.options import (
+    FLIGHT_DEFAULTS,
     AsJson,
     Controller,
     Controllers,
@@ -23,48 +23,26 @@ from flytune.errors import BadInput
 FlightsFile = Annotated[Path | None, Parameter(name="--flights", metavar="FILE.npz")]
 
 
-@Parameter(name="*")
-@dataclass(frozen=True, kw_only=True)
-class EvaluateOptions(FlightOptions):
-    """How one controller is flown, and where the result goes."""
-
-    as_json: AsJson = False
-    out: Annotated[Folder, Parameter(help="where to write evaluation.json (default: the run directory)")] = None
-    flights: Annotated[FlightsFile, Parameter(help="write the trajectories, with named columns")] = None
-
-
-@Parameter(name="*")
-@dataclass(frozen=True, kw_only=True)
-class CompareOptions(FlightOptions):
-    """How several controllers are flown, and where the comparison goes."""
-
-    as_json: AsJson = False
-    out: Annotated[Folder, Parameter(help="where to write comparison.html and comparison.json (default: nowhere)")] = (
-        None
-    )
-    flights: Annotated[FlightsFile, Parameter(help="write the trajectories, as FILE-1.npz, FILE-2.npz, ...")] = None
-
-
-@Parameter(name="*")
-@dataclass(frozen=True, kw_only=True)
-class ReportOptions(FlightOptions):
-    """How the controllers of a report are flown, and where the page goes."""
-
-    out: Annotated[Path, Parameter(metavar="FILE", help="the page")] = Path("report.html")
-
-
-def evaluate(controller: Controller, /, *, options: EvaluateOptions = EvaluateOptions()) -> None:
+def evaluate(
+    controller: Controller,
+    /,
+    *,
+    options: FlightOptions = FLIGHT_DEFAULTS,
+    as_json: AsJson = False,
+    out: Annotated[Folder, Parameter(help="where to write evaluation.json (default: the run directory)")] = None,
+    flights: Annotated[FlightsFile, Parameter(help="write the trajectories, with named columns")] = None,
+) -> None:
     """Fly many trials and judge the step response."""
     from flytune.evaluation.evaluate import evaluate, write_evaluation
 
-    check_outputs(options.out, options.flights)
-    evaluation = evaluate(controller, options.task, **options.settings())
+    check_outputs(out, flights)
+    evaluation = evaluate(controller, **options.settings())
     judgement = evaluation.judgement
-    if options.flights is not None:
-        evaluation.flights.save(options.flights)
-    print(json.dumps(judgement.to_dict()) if options.as_json else judgement.table(), flush=True)
-    if options.out is not None:
-        write_evaluation(options.out, judgement)
+    if flights is not None:
+        evaluation.flights.save(flights)
+    print(json.dumps(judgement.to_dict()) if as_json else judgement.table(), flush=True)
+    if out is not None:
+        write_evaluation(out, judgement)
     elif os.path.isdir(controller):
         try:
             write_evaluation(Path(controller), judgement)
@@ -72,35 +50,51 @@ def evaluate(controller: Controller, /, *, options: EvaluateOptions = EvaluateOp
             print(f"not kept: {error}", file=sys.stderr)
 
 
-def compare(controllers: Controllers, /, *, options: CompareOptions = CompareOptions()) -> None:
+def compare(
+    controllers: Controllers,
+    /,
+    *,
+    options: FlightOptions = FLIGHT_DEFAULTS,
+    as_json: AsJson = False,
+    out: Annotated[
+        Folder, Parameter(help="where to write comparison.html and comparison.json (default: nowhere)")
+    ] = None,
+    flights: Annotated[FlightsFile, Parameter(help="write the trajectories, as FILE-1.npz, FILE-2.npz, ...")] = None,
+) -> None:
     """Fly two or more controllers from the same initial conditions, and judge them side by side."""
     from flytune.evaluation.comparison import compare
     from flytune.evaluation.evaluate import evaluate_all
     from flytune.report.report import write_report
 
-    check_outputs(options.out, options.flights)
+    check_outputs(out, flights)
     first, *others = controllers
     if not others:
         raise BadInput(f"CONTROLLER: {first} alone cannot be compared. Allowed: two or more. Name another.")
-    evaluations = evaluate_all(controllers, options.task, **options.settings())
+    evaluations = evaluate_all(controllers, **options.settings())
     comparison = compare([evaluation.judgement for evaluation in evaluations])
-    if options.flights is not None:
+    if flights is not None:
         for number, evaluation in enumerate(evaluations, start=1):
-            evaluation.flights.save(options.flights.with_stem(f"{options.flights.stem}-{number}"))
-    print(json.dumps(comparison.to_dict()) if options.as_json else comparison.table(), flush=True)
-    if options.out is not None:
-        make_folder(options.out)
-        write_json(options.out / "comparison.json", comparison.to_dict())
-        write_report(options.out / "comparison.html", evaluations, comparison)
+            evaluation.flights.save(flights.with_stem(f"{flights.stem}-{number}"))
+    print(json.dumps(comparison.to_dict()) if as_json else comparison.table(), flush=True)
+    if out is not None:
+        make_folder(out)
+        write_json(out / "comparison.json", comparison.to_dict())
+        write_report(out / "comparison.html", evaluations, comparison)
 
 
-def report(controllers: Controllers, /, *, options: ReportOptions = ReportOptions()) -> None:
+def report(
+    controllers: Controllers,
+    /,
+    *,
+    options: FlightOptions = FLIGHT_DEFAULTS,
+    out: Annotated[Path, Parameter(metavar="FILE", help="the page")] = Path("report.html"),
+) -> None:
     """Print the tables of one or more controllers, and write one self-contained HTML page."""
     from flytune.evaluation.evaluate import evaluate_all
     from flytune.report.report import write_report
 
-    check_file(options.out)
-    evaluations = evaluate_all(controllers, options.task, **options.settings())
+    check_file(out)
+    evaluations = evaluate_all(controllers, **options.settings())
     print("\n\n".join(evaluation.judgement.table() for evaluation in evaluations), end="\n\n")
-    write_report(options.out, evaluations)
-    print(options.out)
+    write_report(out, evaluations)
+    print(out)

@@ -1,7 +1,7 @@
 """Options that several commands share, as types; and the checks of the files a command is going to write."""
 
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -19,20 +19,16 @@ CONTROLLER_HELP = (
 )
 
 
-def whole_number(kind: type, tokens: Sequence[Token]) -> int:
-    """The whole number that was typed; digits alone, so that 3.7 is refused and not rounded."""
-    try:
-        return int(tokens[0].value)
-    except ValueError:
-        raise ValueError("a whole number") from None
+def number_reader(kind: type, allowed: str) -> Callable[[type, Sequence[Token]], Any]:
+    """A converter for options that are numbers: 3.7 is no whole number, and is refused instead of rounded."""
 
+    def read(_: type, tokens: Sequence[Token]) -> Any:
+        try:
+            return kind(tokens[0].value)
+        except ValueError:
+            raise ValueError(allowed) from None
 
-def real_number(kind: type, tokens: Sequence[Token]) -> float:
-    """The number that was typed."""
-    try:
-        return float(tokens[0].value)
-    except ValueError:
-        raise ValueError("a number") from None
+    return read
 
 
 if TYPE_CHECKING:  # a type checker cannot read a list that is made at run time
@@ -44,14 +40,13 @@ else:
 Task = Annotated[str, Parameter(name="TASK", help=TASK_HELP)]
 Controller = Annotated[str, Parameter(name="CONTROLLER", help=CONTROLLER_HELP)]
 Controllers = Annotated[tuple[str, ...], Parameter(name="CONTROLLER", help=CONTROLLER_HELP)]
-Whole = Annotated[int, Parameter(metavar="N", converter=whole_number)]
-Real = Annotated[float, Parameter(converter=real_number)]
+Whole = Annotated[int, Parameter(metavar="N", converter=number_reader(int, "a whole number"))]
+Real = Annotated[float, Parameter(converter=number_reader(float, "a number"))]
 Flag = Annotated[bool, Parameter(negative=(), show_default=False)]
 Assignments = Annotated[
     tuple[str, ...], Parameter(metavar="PATH=VALUE", consume_multiple=(1, None), negative=(), show_default=False)
 ]
 Folder = Annotated[Path | None, Parameter(name="--out", metavar="DIR")]
-Steps = Annotated[Whole | None, Parameter(help="number of environment steps in all (default: the task's own)")]
 Edits = Annotated[Assignments, Parameter(name="--set")]
 AsJson = Annotated[Flag, Parameter(name="--json", help="print one JSON object instead of the table")]
 
@@ -91,14 +86,10 @@ class FlightOptions:
 
     def settings(self) -> dict[str, Any]:
         """The keyword arguments of `flytune.evaluate`."""
-        return {
-            "trials": self.trials,
-            "seed": self.seed,
-            "duration": self.duration,
-            "initial_conditions": self.initial_conditions,
-            "simulator": self.simulator,
-            "simulator_options": assignments(self.simulator_options),
-        }
+        return vars(self) | {"simulator_options": assignments(self.simulator_options)}
+
+
+FLIGHT_DEFAULTS = FlightOptions()
 
 
 def assignments(texts: Sequence[str]) -> dict[str, Any]:

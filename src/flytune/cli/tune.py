@@ -47,7 +47,7 @@ class TuneOptions:
             "the others start from new weights"
         ),
     ] = DEFAULT_TRAINER
-    iterations: Annotated[
+    most_iterations: Annotated[
         Whole, Parameter(name=("--iterations", "--steps"), help="largest number of edits, each with a training")
     ] = 12
     seed: Annotated[Whole, Parameter(help="seed of the trainings")] = 0
@@ -71,12 +71,10 @@ def tune(task: TuneTask = None, /, *, options: TuneOptions) -> None:
 
     with show_progress() as on_progress:
         result = tune(
-            options.settling_time, overshoot=options.overshoot, error=options.error, axis=options.axis,
-            percentile=options.percentile, at_most=options.at_most, tolerance=options.tolerance, task=task,
-            edits=assignments(options.edits), rules=options.rules, trainer=options.trainer, seed=options.seed,
-            most_iterations=options.iterations, out=options.out, resume=options.resume,
-            on_message=lambda line: print(line, flush=True), on_progress=on_progress,
-        )  # fmt: skip
+            **vars(options) | {"task": task, "edits": assignments(options.edits)},
+            on_message=lambda line: print(line, flush=True),
+            on_progress=on_progress,
+        )
     print(result.directory)
     if not result.met:
         raise Unmet(result.why())

@@ -18,7 +18,7 @@ SHARED = {  # what has to be the same: the option that sets it, and its unit
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
 class Comparison:
-    """Several controllers over the same trials, under different names, and how each differs from the reference."""
+    """Several controllers over the same trials, no two names alike, and how each differs from the reference."""
 
     judgements: tuple[Judgement, ...]
     reference: int  # which of them the others are compared with
@@ -29,7 +29,7 @@ class Comparison:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """The controllers' names, no two alike."""
+        """The names of the controllers."""
         return tuple(judgement.name for judgement in self.judgements)
 
     def to_dict(self) -> dict:
@@ -43,7 +43,7 @@ class Comparison:
 
     def table(self) -> str:
         """The comparison for a terminal: a row per controller, then the differences in words."""
-        return comparison_text(self.judgements, self.reference, self.differences)
+        return comparison_text(self)
 
     __str__ = table
 
@@ -53,11 +53,8 @@ def compare(judgements: Sequence[Judgement], *, reference: int = 0) -> Compariso
 
     Initial state and noise of a trial depend on seed and trial alone. So trial i of one controller is paired with
     trial i of the reference, and their difference does not contain the spread of the initial states. Simulator, task
-    and vehicle may differ.
-
-    Args:
-        judgements: of the controllers, in the order of the table; names that occur twice are made different.
-        reference: the index of the controller that the others are compared with.
+    and vehicle may differ. Names that occur twice are made different. `reference` is the index of the controller that
+    the others are compared with.
 
     Raises:
         BadInput: fewer than two, no such reference, or trials that are not the same.
@@ -69,12 +66,13 @@ def compare(judgements: Sequence[Judgement], *, reference: int = 0) -> Compariso
     if not 0 <= reference < len(judgements):
         raise BadInput(f"reference: {reference} is not allowed. Allowed: 0 to {len(judgements) - 1}, a controller.")
     named = _distinguish(judgements)
+    first = named[0]
     for field, (option, unit) in SHARED.items():
-        first, *others = ((controller.name, getattr(controller, field)) for controller in named)
-        for name, value in others:
-            if value != first[1]:
+        wanted = getattr(first, field)
+        for other in named:
+            if (value := getattr(other, field)) != wanted:
                 raise BadInput(
-                    f"{option}: {first[1]}{unit} for {first[0]} and {value}{unit} for {name} is not allowed. "
+                    f"{option}: {wanted}{unit} for {first.name} and {value}{unit} for {other.name} is not allowed. "
                     f"Allowed: the same for every controller. Fly all of them with one --{option}."
                 )
     against = named[reference]
@@ -84,14 +82,16 @@ def compare(judgements: Sequence[Judgement], *, reference: int = 0) -> Compariso
 
 
 def _distinguish(judgements: Sequence[Judgement]) -> list[Judgement]:
-    """The judgements, no two names alike: told apart by what differs, by numbers where nothing does."""
+    """The judgements, no two names alike: what differs is added to a name, or a number where nothing does."""
     named: dict[str, Judgement] = {}
     for judgement in judgements:
         alike = [other for other in judgements if other.name == judgement.name]
-        telling = (field for field in MAY_DIFFER if len({getattr(one, field) for one in alike}) == len(alike) > 1)
-        told = [str(getattr(judgement, field)) for field in telling][:1]
-        name = unique = " ".join([judgement.name or "controller", *(f"({text})" for text in told)])
-        number = 1
+        name = judgement.name or "controller"
+        for field in MAY_DIFFER:
+            if len({getattr(one, field) for one in alike}) == len(alike) > 1:
+                name = f"{name} ({getattr(judgement, field)})"
+                break
+        unique, number = name, 1
         while unique in named:
             number += 1
             unique = f"{name} ({number})"

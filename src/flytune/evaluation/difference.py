@@ -1,27 +1,58 @@
 """Paired differences: one metric of a controller less that of another, trial by trial. NumPy and SciPy only."""
 
 import dataclasses
+import math
 
 import numpy as np
 from jaxtyping import Float
 from scipy.special import betainc
 
-from flytune.evaluation.judge import AXES, Judgement, PerTrial
+from flytune.evaluation.judge import Judgement, PerTrial
 from flytune.evaluation.statistics import finite
 
+FIELDS = {  # of the judgement: in words, and how a controller with more of it compares, how one with less
+    "settling_time": ("settling time", "later", "earlier"),
+    "overshoot": ("overshoot", "more", "less"),
+    "steady_state_error": ("steady-state error", "farther off", "nearer"),
+    "rms_error": ("RMS error", "larger", "smaller"),
+    "peak_speed": ("peak speed", "faster", "slower"),
+    "action_rms": ("action, RMS", "harder", "more gently"),
+    "action_total_variation": ("action, change", "more", "less"),
+}
+SHOWN = {"m": ("mm", 1e3), "rad": ("deg", math.degrees(1))}  # units of tables and figures, with their factors
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
+
+@dataclasses.dataclass(frozen=True)
 class Metric:
     """One number per trial of a judgement, the smaller the better (of speed and action: the less)."""
 
     field: str  # of the judgement
     channel: str | None  # x, y, z, yaw or position; None for a metric of the whole flight
     unit: str
+    verb: str = ""  # what a controller does, for a sentence; "" where no sentence is made of it
+    equal: str = ""  # the same, as much as another controller
+    decimals: int = 2  # in a sentence
 
     @property
     def name(self) -> str:
         """The metric by the keys of `evaluate --json`: position.settling_time, peak_speed, action.rms."""
         return f"{self.channel}.{self.field}" if self.channel else self.field.replace("action_", "action.")
+
+    @property
+    def title(self) -> str:
+        """The metric in words."""
+        title = FIELDS[self.field][0]
+        return f"{self.channel} {title}" if self.channel else title
+
+    @property
+    def ways(self) -> tuple[str, str]:
+        """How a controller with more of it compares, and how one with less."""
+        return FIELDS[self.field][1:]
+
+    @property
+    def shown(self) -> tuple[str, float]:
+        """The unit of tables and figures, and its factor."""
+        return ("%", 100.0) if self.field == "overshoot" else SHOWN.get(self.unit, (self.unit, 1.0))
 
     def values(self, judgement: Judgement) -> PerTrial:
         """The metric of each trial; +inf where it failed, NaN where the metric does not apply.
@@ -33,16 +64,18 @@ class Metric:
 
 
 METRICS = (
-    *(Metric(field="settling_time", channel=channel, unit="s") for channel in ("position", *AXES)),
-    Metric(field="overshoot", channel="position", unit="1"),
-    Metric(field="overshoot", channel="yaw", unit="1"),
-    Metric(field="steady_state_error", channel="position", unit="m"),
-    Metric(field="steady_state_error", channel="yaw", unit="rad"),
-    Metric(field="rms_error", channel="position", unit="m"),
-    Metric(field="rms_error", channel="yaw", unit="rad"),
-    Metric(field="peak_speed", channel=None, unit="m/s"),
-    Metric(field="action_rms", channel=None, unit="1"),
-    Metric(field="action_total_variation", channel=None, unit="1"),
+    Metric("settling_time", "position", "s", "settles", "as early as"),
+    *(Metric("settling_time", axis, "s") for axis in "xyz"),
+    Metric("settling_time", "yaw", "s", "settles in yaw", "as early as"),
+    Metric("overshoot", "position", "1", "overshoots", "as much as"),
+    Metric("overshoot", "yaw", "1"),
+    Metric("steady_state_error", "position", "m", "stays", "as near as"),
+    Metric("steady_state_error", "yaw", "rad", "points", "as near as", decimals=3),
+    Metric("rms_error", "position", "m"),
+    Metric("rms_error", "yaw", "rad"),
+    Metric("peak_speed", None, "m/s", "peaks", "as fast as"),
+    Metric("action_rms", None, "1", "acts (RMS)", "as hard as", decimals=4),
+    Metric("action_total_variation", None, "1", "changes its action per step", "as much as", decimals=4),
 )
 
 
@@ -70,26 +103,21 @@ class Difference:
         return self.better + self.worse + self.tied
 
     def to_dict(self) -> dict:
-        """The difference as plain Python values; None where infinite, `better` and `worse` then tell to which side."""
+        """Plain Python values; None where infinite: `better` and `worse` then say to which side."""
         return {
             "who": self.name,
             "metric": self.metric.name,
             "unit": self.metric.unit,
-            "median": finite(self.median),
-            "low": finite(self.low),
-            "high": finite(self.high),
-            "better": self.better,
-            "worse": self.worse,
-            "tied": self.tied,
-            "left_out": self.left_out,
+            **{name: finite(getattr(self, name)) for name in ("median", "low", "high")},
+            **{name: getattr(self, name) for name in ("better", "worse", "tied", "left_out")},
         }
 
 
 def paired_difference(controller: PerTrial, reference: PerTrial) -> PerTrial:
     """Controller less reference, trial by trial: +inf where only the controller failed, -inf where only the other did.
 
-    0 where both failed, which is a tie and no knowledge of who failed worse. NaN where the metric does not apply to
-    either, or applies to one of two that did not fail.
+    0 where both failed: they tie, since nothing says which failed worse. NaN where the metric does not apply to either,
+    or applies to one of two that did not fail.
     """
     lost, beaten = np.isposinf(controller), np.isposinf(reference)
     with np.errstate(invalid="ignore"):
@@ -100,31 +128,23 @@ def paired_difference(controller: PerTrial, reference: PerTrial) -> PerTrial:
 def compare_metric(controller: Judgement, reference: Judgement, metric: Metric) -> Difference:
     """How a controller differs from the reference in one metric, with the 95 % bootstrap interval of the median."""
     paired = paired_difference(metric.values(controller), metric.values(reference))
-    applies = ~np.isnan(paired)
-    middle, low, high = median_and_interval(paired[applies])
-    return Difference(
-        name=controller.name,
-        metric=metric,
-        median=middle,
-        low=low,
-        high=high,
-        better=int(np.count_nonzero(paired < 0)),
-        worse=int(np.count_nonzero(paired > 0)),
-        tied=int(np.count_nonzero(paired == 0)),
-        left_out=int(np.count_nonzero(~applies)),
-    )
+    left_out = np.isnan(paired)
+    middle, low, high = median_and_interval(paired[~left_out])
+    flags = {"better": paired < 0, "worse": paired > 0, "tied": paired == 0, "left_out": left_out}
+    counts = {name: int(np.count_nonzero(flag)) for name, flag in flags.items()}
+    return Difference(name=controller.name, metric=metric, median=middle, low=low, high=high, **counts)
 
 
-def median_and_interval(values: Float[np.ndarray, "M"], level: float = 0.95) -> tuple[float, float, float]:
-    """Median of independent values, and the ends of its bootstrap interval; NaN without a value.
+def median_and_interval(values: Float[np.ndarray, "M"]) -> tuple[float, float, float]:
+    """Median of independent values, and the ends of its 95 % bootstrap interval; NaN without a value.
 
     The median of a resample is one of the values, and at most the k-th smallest of M if at least ceil(M / 2) of M
     draws are, each with a chance of k / M:
 
         P(median of a resample <= k-th) = I_{k / M}(m, M - m + 1),    m = ceil(M / 2), I the incomplete beta function
 
-    This is `bootstrap_interval` of one group with endless draws, in no time; and infinite values, which may be of
-    either sign in a difference, need no care.
+    This is the limit of `bootstrap_interval` of one group for many draws. Infinite values, which have either sign in
+    a difference, need no special care.
 
     Source: Efron, Bootstrap methods: another look at the jackknife (1979), section 3.
     """
@@ -132,5 +152,5 @@ def median_and_interval(values: Float[np.ndarray, "M"], level: float = 0.95) -> 
         return np.nan, np.nan, np.nan
     ordered, middle = np.sort(values), (values.size + 1) // 2
     chance = betainc(middle, values.size - middle + 1, np.arange(1, values.size + 1) / values.size)
-    low, high = np.searchsorted(chance, [(1 - level) / 2, (1 + level) / 2])
+    low, high = np.searchsorted(chance, [(1 - 0.95) / 2, (1 + 0.95) / 2])
     return float(ordered[middle - 1]), float(ordered[low]), float(ordered[high])

@@ -1,4 +1,4 @@
-"""Evaluating: controllers named or given are found, flown and judged in one call."""
+"""Evaluating: controllers are found by name, flown and judged in one call."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -16,7 +16,7 @@ from flytune.task.task import Task, load_task
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
 class Evaluation:
-    """How one controller flew a task, how that was judged, and how the controller was trained."""
+    """The flights of one controller, their judgement, and how the controller was trained."""
 
     name: str
     task: Task
@@ -64,10 +64,7 @@ def evaluate(
 def evaluate_all(
     controllers: Sequence[str | Controller], task: str | Path | Task | None = None, **settings: Any
 ) -> list[Evaluation]:
-    """The evaluations of several controllers over the same trials; all of them are found before the first one flies.
-
-    The arguments and errors are those of `evaluate`.
-    """
+    """The evaluations of several controllers, see `evaluate`; all of them are found before the first one flies."""
     return [evaluate(found, **settings) for found in [_find(controller, task) for controller in controllers]]
 
 
@@ -75,9 +72,7 @@ def _find(controller: str | Controller, task: str | Path | Task | None, name: st
     wanted = load_task(task) if isinstance(task, str | Path) else task
     found = find_controller(controller, wanted) if isinstance(controller, str) else controller
     if not isinstance(found, FoundController):
-        return FoundController(
-            name=name, controller=found, task=wanted or load_task("baseline"), metrics=None, about={}
-        )
+        return FoundController(name=name, controller=found, task=wanted or load_task("baseline"))
     return dataclasses.replace(found, name=name or found.name, task=wanted or found.task)
 
 

@@ -1,28 +1,37 @@
-"""Flights: recorded trajectories, all a judge ever sees of a controller. NumPy only."""
+"""Flights: recorded trajectories, which are all that the judge knows of a controller. NumPy only."""
 
 import dataclasses
 import io
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from flytune.config.files import write_bytes
 
-STATE_COLUMNS = {
-    "position": ("x", "y", "z"),
-    "attitude": ("qx", "qy", "qz", "qw"),
-    "velocity": ("vx", "vy", "vz"),
-    "body_rate": ("wx", "wy", "wz"),
-    "rotor_speed_rpm": ("rpm0", "rpm1", "rpm2", "rpm3"),
-    "action": ("a0", "a1", "a2", "a3"),
+COLUMNS = {  # per sample: the unit of a field, and the names of its columns in a file
+    "position": ("m", "x y z"),
+    "attitude": ("1", "qx qy qz qw"),
+    "velocity": ("m/s", "vx vy vz"),
+    "body_rate": ("rad/s", "wx wy wz"),
+    "rotor_speed_rpm": ("rpm", "rpm0 rpm1 rpm2 rpm3"),
+    "action": ("1", "a0 a1 a2 a3"),
 }
-COLUMN_UNITS = {"position": "m", "attitude": "1", "velocity": "m/s", "body_rate": "rad/s", "rotor_speed_rpm": "rpm",
-                "action": "1"}  # fmt: skip
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Flights:
+class Labels:
+    """The controller that flew, and its task, vehicle, simulator and initial conditions."""
+
+    name: str  # as the user named it
+    task: str
+    vehicle: str
+    simulator: str
+    seed: int
+    initial_conditions: str  # "clear" or "paper"
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Flights(Labels):
     """True trajectories of N trials, sampled at the control rate from the start (sample 0) to the end, T + 1 samples.
 
     A trial that crashed (left a ball of 10 m around the target, or stopped being finite) holds its last state from
@@ -41,12 +50,6 @@ class Flights:
     target_position: np.ndarray  # [3] m
     target_yaw: float  # rad
     speed_bound: float | None  # m/s, of the task's speed termination; None where it has none
-    name: str  # the controller, as the user named it
-    task: str
-    vehicle: str
-    simulator: str
-    seed: int
-    initial_conditions: str  # "clear" or "paper"
 
     def __repr__(self) -> str:
         crashed = f", {np.count_nonzero(self.crashed)} crashed" if self.crashed.any() else ""
@@ -70,32 +73,25 @@ class Flights:
         Raises:
             BadInput: the file cannot be written.
         """
+        columns = {"time": ("s", np.broadcast_to(self.time, self.position.shape[:2]))}
+        for field, (unit, names) in COLUMNS.items():
+            parts = np.moveaxis(getattr(self, field), -1, 0)
+            columns |= {name: (unit, part) for name, part in zip(names.split(), parts, strict=True)}
+        columns |= {f"margin_{name}": ("1", margin) for name, margin in self.margins.items()}
         content = io.BytesIO()
-        np.savez_compressed(content, **self._arrays())
+        np.savez_compressed(
+            content,
+            data=np.stack([values for _, values in columns.values()], axis=-1).astype(np.float32),
+            columns=np.array(list(columns)),
+            units=np.array([unit for unit, _ in columns.values()]),
+            crashed=self.crashed,
+            target_position=self.target_position,
+            target_yaw=self.target_yaw,
+            who=self.name,
+            task=self.task,
+            vehicle=self.vehicle,
+            world=self.simulator,
+            seed=self.seed,
+            starts=self.initial_conditions,
+        )
         write_bytes(path, content.getvalue(), "flights")
-
-    def _arrays(self) -> dict[str, Any]:
-        blocks = [np.broadcast_to(self.time[None, :, None], (*self.position.shape[:2], 1))]
-        columns, units = ["time"], ["s"]
-        for field, names in STATE_COLUMNS.items():
-            blocks.append(getattr(self, field))
-            columns += names
-            units += [COLUMN_UNITS[field]] * len(names)
-        for name, margin in self.margins.items():
-            blocks.append(margin[..., None])
-            columns.append(f"margin_{name}")
-            units.append("1")
-        return {
-            "data": np.concatenate(blocks, axis=-1).astype(np.float32),
-            "columns": np.array(columns),
-            "units": np.array(units),
-            "crashed": self.crashed,
-            "target_position": self.target_position,
-            "target_yaw": self.target_yaw,
-            "who": self.name,
-            "task": self.task,
-            "vehicle": self.vehicle,
-            "world": self.simulator,
-            "seed": self.seed,
-            "starts": self.initial_conditions,
-        }

@@ -1,4 +1,4 @@
-"""Flying: a controller, a task and initial conditions become recorded flights, in any simulator."""
+"""Flying: the recorded flights of a controller on a task, in any simulator."""
 
 import dataclasses
 from collections.abc import Callable, Mapping
@@ -15,7 +15,7 @@ from flytune.evaluation.flights import Flights
 from flytune.physics.dynamics import CONTROL_PERIOD
 from flytune.physics.vehicle import Vehicle
 from flytune.runs.find import FoundController
-from flytune.simulation.environment import Episode, Outcome, begin, hold, is_crashed, margins_along
+from flytune.simulation.environment import Episode, begin, hold, is_crashed, margins_along
 from flytune.simulation.host import HostEnvironment, ravel
 from flytune.simulation.rollout import Draw, rollout
 from flytune.simulation.simulator import WIDTHS, Simulator, VehicleStates, state_from, state_numbers
@@ -46,14 +46,15 @@ def fly(
     can be compared on equal terms. Trials run to their end whether or not a termination is crossed.
 
     Args:
-        controller: what decides, or what `find_controller` found.
-        task: what it is asked to do, and with which vehicle.
-        trials: how many, 1 or more.
+        controller: a controller, or the result of `find_controller`.
+        task: the task, with its vehicle.
+        trials: number of trials, 1 or more.
         seed: of initial states and noise.
         initial_conditions: `clear` (z0 >= 0.1 m) or `paper` (exactly as printed).
         duration: of a trial in s, more than 0.5; the task's own where None.
-        name: the controller's name, for the record.
-        simulator: one of `flytune`, `pybullet`, `mujoco`; or what makes one of your own, from a vehicle and a number.
+        name: the controller's name in the flights.
+        simulator: one of `flytune`, `pybullet`, `mujoco`; or a function that makes another one, from a vehicle and the
+            number of trials.
         simulator_options: of that simulator, see `make_simulator`.
 
     Raises:
@@ -74,16 +75,16 @@ def fly(
     if not 0 <= seed < 2**32:
         raise BadInput(f"seed: {seed} is not allowed. Allowed: a whole number, 0 to {2**32 - 1}.")
     steps = round(duration / CONTROL_PERIOD)
-    keys = trial_keys(seed, trials)
-    starts, noise_keys = _begin(task, EVALUATION_INITIAL_STATES[initial_conditions], keys)
+    initial_state = EVALUATION_INITIAL_STATES[initial_conditions]
+    starts, noise_keys = _begin(task, initial_state, trial_keys(seed, trials))
     if isinstance(simulator, str):
-        where, flown_in = simulator, make_simulator(simulator, task.vehicle, trials, simulator_options)
+        simulator_name, made = simulator, make_simulator(simulator, task.vehicle, trials, simulator_options)
     else:
-        where, flown_in = getattr(simulator, "__name__", "custom"), simulator(task.vehicle, trials)
+        simulator_name, made = getattr(simulator, "__name__", "custom"), simulator(task.vehicle, trials)
     try:
-        record = rollout_trials(flown_in, controller, task, starts, noise_keys, steps, name)
+        record = rollout_trials(made, controller, task, starts, noise_keys, steps, name)
     finally:
-        flown_in.close()
+        made.close()
     states, actions = np.asarray(record.states), np.asarray(record.actions)
     along = VehicleStates.from_rows(np.ascontiguousarray(states.transpose(2, 0, 1)))
     return Flights(
@@ -98,7 +99,7 @@ def fly(
         name=name,
         task=task.name,
         vehicle=task.vehicle.name,
-        simulator=where,
+        simulator=simulator_name,
         seed=seed,
         initial_conditions=initial_conditions,
     )
@@ -120,10 +121,9 @@ def rollout_trials(
     Raises:
         Diverged: the controller answered a finite observation with an action that is not finite.
     """
-    flown = (controller, task, starts, noise_keys, steps)
     if simulator.physics is None:
-        return _rollout_on_host(simulator, *flown, name)
-    record, given, finite = _rollout_on_device(simulator.physics, *flown)
+        return _rollout_on_host(simulator, controller, task, starts, noise_keys, steps, name)
+    record, given, finite = _rollout_on_device(simulator.physics, controller, task, starts, noise_keys, steps)
     if not np.all(finite):
         trial, step = np.argwhere(~np.asarray(finite).T)[0]
         raise _not_finite(name, given[step, trial], trial, step)
@@ -133,7 +133,7 @@ def rollout_trials(
 def _rollout_on_host(
     simulator: Simulator, controller: Any, task: Task, starts: Any, noise_keys: Any, steps: int, name: str
 ) -> Record:
-    """The same where controller and simulator take turns."""
+    """The trajectories where controller and simulator take turns."""
     trials = len(noise_keys)
     controller, task = jax.device_put((controller, task))  # once, not at every step
     environment = HostEnvironment(task, simulator, trials, ending="hold")
@@ -195,22 +195,19 @@ def _rollout_on_device(
         memory, action, given, finite = _decide(controller, memory, seen)
         return memory, action, (given, finite)
 
-    def keep(after: Episode, moved: Episode, outcome: Outcome) -> tuple[jax.Array, jax.Array]:
-        return state_numbers(after.state), after.last_action
-
-    episodes = _started(task, starts)
     (episodes, _), step = rollout(
         task,
         decide,
-        (episodes, _initial_memory(controller, starts.shape[-1])),
+        (_started(task, starts), _initial_memory(controller, starts.shape[-1])),
         jnp.arange(steps),
         ending=hold,
-        record=keep,
+        record=lambda after, moved, outcome: (state_numbers(after.state), after.last_action),
         draw=lambda index: Draw(noise=_noise(noise_keys, index)),
         physics=physics,
     )
-    states, actions = (jnp.concatenate([first[None], later]) for first, later in
-                       zip((starts, episodes.last_action * 0), step.record, strict=True))  # fmt: skip
+    states, actions = step.record
+    states = jnp.concatenate([starts[None], states])
+    actions = jnp.concatenate([episodes.last_action[None] * 0, actions])
     return Record(states, actions, episodes.steps < 0), *step.notes
 
 
@@ -247,7 +244,6 @@ def _margins(task: Task, states: jax.Array, actions: jax.Array) -> dict[str, jax
 
 
 def _not_finite(name: str, action: Any, trial: int | np.integer, step: int | np.integer) -> Diverged:
-    """The error of a controller whose action is not finite."""
     return Diverged(
         f"{name or 'controller'}: action {action} is not finite in trial {trial} "
         f"at {step * CONTROL_PERIOD:.2f} s, on a finite observation."

@@ -1,13 +1,14 @@
-"""The judge: Flights in, one Judgement out, the same whoever flew. NumPy only."""
+"""The judge: one Judgement of Flights, by the same definitions for every controller and simulator. NumPy only."""
 
 import dataclasses
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float
 
 from flytune.evaluation import lower_bounds, metrics
-from flytune.evaluation.flights import Flights
+from flytune.evaluation.flights import Flights, Labels
 from flytune.evaluation.statistics import finite, median, summary
 from flytune.evaluation.table import AXES, response_line, response_text
 from flytune.simulation import CRASH_DISTANCE
@@ -18,14 +19,24 @@ SECONDARY_BANDS = {"2%": 0.02, "5%": 0.05}  # of each trial's own step
 TIMES = ("median", "p25", "p75", "p95")
 OVERSHOOTS = ("median", "p75", "p95")
 ERRORS = ("median", "p75", "p95", "max")
+RESPONSE = {  # metric of a channel -> its quantiles in `to_dict`
+    "settling_time": TIMES,
+    "rise_time": TIMES,
+    "overshoot": OVERSHOOTS,
+    "overshoot_raw": OVERSHOOTS,
+    "steady_state_error": ERRORS,
+    "rms_error": ERRORS,
+    "itae": ERRORS,
+}
+OF_AXES = ("rise_time", "itae")  # metrics that the position does not have
 
 PerTrial = Float[np.ndarray, "N"]
 PerTrialFlag = Bool[np.ndarray, "N"]
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
-class Judgement:
-    """What N trials flew like, one value per trial and metric; `to_dict` and `str` summarise them.
+class Judgement(Labels):
+    """The step response of N trials, one value per trial and metric; `to_dict` and `str` summarise them.
 
     Every array is [N], in the order of the flights. +inf marks a trial that failed by the metric: one that did not
     settle, or never rose; and one that crashed, in every metric of the response. NaN marks a trial to which the
@@ -35,12 +46,6 @@ class Judgement:
     Source: docs, definitions.
     """
 
-    name: str
-    task: str
-    vehicle: str
-    simulator: str
-    seed: int
-    initial_conditions: str
     duration: float  # s
     settling_time: Mapping[str, PerTrial]  # channel -> s
     secondary_settling_time: Mapping[str, Mapping[str, PerTrial]]  # "2%" | "5%" -> channel -> s
@@ -85,14 +90,15 @@ class Judgement:
             "seed": int(self.seed),
             "starts": self.initial_conditions,
             "duration": self.duration,
-            "axes": {axis: self._axis(axis) for axis in AXES},
-            "position": {
-                **_settling(self.settling_time["position"]),
-                "overshoot": summary(self.overshoot["position"], OVERSHOOTS),
-                "overshoot_raw": summary(self.overshoot_raw["position"], OVERSHOOTS),
-                "steady_state_error": summary(self.steady_state_error["position"], ERRORS),
-                "rms_error": summary(self.rms_error["position"], ERRORS),
+            "axes": {
+                axis: {
+                    "settled": self.settled(axis),
+                    "small_steps": _count(self.small_step[axis]),
+                    **self._response(axis),
+                }
+                for axis in AXES
             },
+            "position": {"settled": self.settled("position"), **self._response("position")},
             "secondary": {
                 band: {channel: _settling(values) for channel, values in channels.items()}
                 for band, channels in self.secondary_settling_time.items()
@@ -108,18 +114,9 @@ class Judgement:
             "efficiency": {"median": median(self.efficiency)},
         }
 
-    def _axis(self, axis: str) -> dict:
-        return {
-            "settled": self.settled(axis),
-            "small_steps": _count(self.small_step[axis]),
-            "settling_time": summary(self.settling_time[axis], TIMES),
-            "rise_time": summary(self.rise_time[axis], TIMES),
-            "overshoot": summary(self.overshoot[axis], OVERSHOOTS),
-            "overshoot_raw": summary(self.overshoot_raw[axis], OVERSHOOTS),
-            "steady_state_error": summary(self.steady_state_error[axis], ERRORS),
-            "rms_error": summary(self.rms_error[axis], ERRORS),
-            "itae": summary(self.itae[axis], ERRORS),
-        }
+    def _response(self, channel: str) -> dict:
+        fields = [field for field in RESPONSE if channel in getattr(self, field)]
+        return {field: summary(getattr(self, field)[channel], RESPONSE[field]) for field in fields}
 
     def table(self) -> str:
         """The response table for a terminal: plain text, one row per channel, '-' where a quantile is infinite."""
@@ -133,107 +130,88 @@ class Judgement:
 
 
 def judge(flights: Flights) -> Judgement:
-    """Judgement of recorded flights, by the same definitions whoever flew and in whichever world.
+    """Judgement of recorded flights, by the same definitions for every controller and simulator.
 
     A crashed trial is at +inf in every metric of the response, even where its step was small, so that it never
     disappears; it is then not among the small steps. An unsettled trial that did not crash keeps its measured
     overshoot and errors.
 
-    In the secondary bands every trial counts, with the band its own step gives (for yaw the wrapped error at the
-    start): a tiny step asks for a tiny band, which sensor noise alone may break, and a step of 0 for exactly no
-    error.
+    In the secondary bands every trial counts, with a band in proportion to its own step (for yaw the wrapped error at
+    the start): a tiny step has a tiny band, which sensor noise alone may leave.
 
     Source: docs, definitions; C5 of the paper's open points for the bands.
     """
     time = np.asarray(flights.time, dtype=np.float64)
     duration = round(flights.duration, 6)
     crashed = _crashed(flights)
-    channels = _channels(flights, time, crashed)
-    settling = {
-        name: _fail(metrics.settling_time(channel.distance, time, channel.band), crashed)
-        for name, channel in channels.items()
-    }
-    secondary = {
-        band: {
-            name: _fail(metrics.settling_time(channel.distance, time, share * np.abs(channel.distance[:, 0])), crashed)
-            for name, channel in channels.items()
-        }
-        for band, share in SECONDARY_BANDS.items()
-    }
+    responses = {name: channel.response(time, crashed) for name, channel in _channels(flights, time, crashed).items()}
     action = np.asarray(flights.action, dtype=np.float64)
     start = np.asarray(flights.position[:, 0], dtype=np.float64) - flights.target_position
     bound = lower_bounds.settling_time_bound(np.linalg.norm(start, axis=-1), flights.speed_bound)
+    fields: dict[str, Any] = {field.name: getattr(flights, field.name) for field in dataclasses.fields(Labels)}
+    for field in (*RESPONSE, "small_step"):
+        fields[field] = {name: responses[name][field] for name in (AXES if field in OF_AXES else CHANNELS)}
     return Judgement(
-        name=flights.name,
-        task=flights.task,
-        vehicle=flights.vehicle,
-        simulator=flights.simulator,
-        seed=flights.seed,
-        initial_conditions=flights.initial_conditions,
+        **fields,
         duration=duration,
-        settling_time=settling,
-        secondary_settling_time=secondary,
-        rise_time={axis: channels[axis].of_step(metrics.rise_time(channels[axis].course, time)) for axis in AXES},
-        overshoot={name: c.of_step(metrics.overshoot(c.course, c.band)) for name, c in channels.items()},
-        overshoot_raw={name: c.of_step(metrics.overshoot(c.course)) for name, c in channels.items()},
-        steady_state_error={name: _fail(c.steady_state_error, crashed) for name, c in channels.items()},
-        rms_error={name: _fail(metrics.rms_error(c.distance, time), crashed) for name, c in channels.items()},
-        itae={axis: _fail(metrics.itae(channels[axis].distance, time), crashed) for axis in AXES},
-        small_step={name: c.small for name, c in channels.items()},
+        secondary_settling_time={
+            band: {name: response[band] for name, response in responses.items()} for band in SECONDARY_BANDS
+        },
         peak_speed=metrics.peak_speed(np.asarray(flights.velocity, dtype=np.float64)),
         action_rms=metrics.action_rms(action),
         action_total_variation=metrics.action_total_variation(action),
-        efficiency=lower_bounds.efficiency(bound, settling["position"]),
+        efficiency=lower_bounds.efficiency(bound, responses["position"]["settling_time"]),
         infeasible=lower_bounds.infeasible(bound, duration, flights.margins),
         crashed=crashed,
         violated={name: np.any(margin < 0, axis=1) for name, margin in flights.margins.items()},
     )
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
+@dataclasses.dataclass(frozen=True, eq=False)
 class _Channel:
-    """The errors of one channel in the forms the metrics ask for; harmless zeros where the trial crashed."""
+    """The errors of one channel in the forms that the metrics need; zeros where the trial crashed."""
 
     course: Float[np.ndarray, "N K"]  # signed, continuous: overshoot and rise
     distance: Float[np.ndarray, "N K"]  # what the band is compared with: settling, RMS, ITAE
     steady_state_error: PerTrial
-    band: float
-    small: PerTrialFlag
-    crashed: PerTrialFlag
+    band: float = metrics.POSITION_BAND
+    small_step: float = metrics.SMALL_STEP
 
-    def of_step(self, values: PerTrial) -> PerTrial:
-        """Values of a metric that needs a step: +inf where crashed, NaN where the step is small."""
-        return _fail(np.where(self.small, np.nan, values), self.crashed)
+    def response(self, time: Float[np.ndarray, "K"], crashed: PerTrialFlag) -> dict[str, np.ndarray]:
+        """Each metric, and the settling time in each secondary band: +inf where crashed."""
+        small = (np.abs(self.course[:, 0]) < self.small_step) & ~crashed
+        bands = {"settling_time": self.band}
+        bands |= {name: share * np.abs(self.distance[:, 0]) for name, share in SECONDARY_BANDS.items()}
+        of_step = {
+            "rise_time": metrics.rise_time(self.course, time),
+            "overshoot": metrics.overshoot(self.course, self.band),
+            "overshoot_raw": metrics.overshoot(self.course),
+        }
+        values = {
+            **{name: metrics.settling_time(self.distance, time, band) for name, band in bands.items()},
+            **{name: np.where(small, np.nan, metric) for name, metric in of_step.items()},
+            "steady_state_error": self.steady_state_error,
+            "rms_error": metrics.rms_error(self.distance, time),
+            "itae": metrics.itae(self.distance, time),
+        }
+        return {name: np.where(crashed, np.inf, metric) for name, metric in values.items()} | {"small_step": small}
 
 
 def _channels(flights: Flights, time: Float[np.ndarray, "K"], crashed: PerTrialFlag) -> dict[str, _Channel]:
     """The five channels: signed errors (x, y, z), wrapped and unwrapped ones (yaw), a distance (position)."""
-
-    def channel(course: np.ndarray, distance: np.ndarray, steady: np.ndarray, band: float, small: float) -> _Channel:
-        return _Channel(
-            course=course,
-            distance=distance,
-            steady_state_error=steady,
-            band=band,
-            small=(np.abs(course[:, 0]) < small) & ~crashed,
-            crashed=crashed,
-        )
-
     lost = crashed[:, None, None]
     error = np.where(lost, 0.0, np.asarray(flights.position, dtype=np.float64) - flights.target_position)
     attitude = np.where(lost, [0.0, 0.0, 0.0, 1.0], np.asarray(flights.attitude, dtype=np.float64))
     yaw = metrics.yaw_angle(attitude)
     turn, wrapped = metrics.unwrapped_yaw_error(yaw, flights.target_yaw), metrics.wrap_angle(yaw - flights.target_yaw)
-    length = (metrics.POSITION_BAND, metrics.SMALL_STEP)
-    channels = {
-        axis: channel(e, e, metrics.steady_state_error(e, time), *length)
-        for axis, e in zip("xyz", np.moveaxis(error, -1, 0), strict=True)
-    }
+    along, distance = metrics.error_along_start(error), np.linalg.norm(error, axis=-1)
     steady_yaw = metrics.steady_state_yaw_error(wrapped, time)
-    channels["yaw"] = channel(turn, wrapped, steady_yaw, metrics.YAW_BAND, metrics.SMALL_TURN)
-    along, steady = metrics.error_along_start(error), metrics.steady_state_position_error(error, time)
-    channels["position"] = channel(along, np.linalg.norm(error, axis=-1), steady, *length)
-    return channels
+    return {
+        **{name: _Channel(error[..., axis], error[..., axis], metrics.steady_state_error(error[..., axis], time))
+           for axis, name in enumerate("xyz")},
+        "yaw": _Channel(turn, wrapped, steady_yaw, metrics.YAW_BAND, metrics.SMALL_TURN),
+        "position": _Channel(along, distance, metrics.steady_state_position_error(error, time)),
+    }  # fmt: skip
 
 
 def _crashed(flights: Flights) -> PerTrialFlag:
@@ -243,10 +221,6 @@ def _crashed(flights: Flights) -> PerTrialFlag:
     with np.errstate(over="ignore", invalid="ignore"):
         distance = np.linalg.norm(flights.position - flights.target_position, axis=-1)
     return np.logical_or.reduce([flights.crashed, (distance > CRASH_DISTANCE).any(axis=1), *lost])
-
-
-def _fail(values: PerTrial, crashed: PerTrialFlag) -> PerTrial:
-    return np.where(crashed, np.inf, values)
 
 
 def _settling(settling_time: PerTrial) -> dict:

@@ -1,4 +1,7 @@
-"""Physical lower bounds on the settling time, and how near a flight came to them. NumPy only."""
+"""Physical lower bounds on the settling time, and how near a flight came to them. NumPy only.
+
+Source: docs, definitions.
+"""
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -13,10 +16,10 @@ def settling_time_bound(
 
         bound = max(0, |e_p(0)| - band) / speed_bound
 
-    0 everywhere without a speed bound (m/s): then nothing is known but that time does not run backwards. With distance
-    and band in rad and a body rate bound in rad/s it is the bound for the yaw.
+    0 everywhere without a speed bound (m/s). With distance and band in rad and a body rate bound in rad/s it is the
+    bound for the yaw.
 
-    Source: docs, definitions; paper R14 for the speed bounds.
+    Source: paper R14 for the speed bounds.
     """
     if speed_bound is None:
         return np.zeros_like(distance)
@@ -53,7 +56,7 @@ def infeasible(bound: Float[np.ndarray, "N"], duration: float, margins: dict[str
     `bound` and `duration` in s; `margins`: termination name -> [N, T + 1], negative beyond the bound. A start exactly
     on a bound is allowed, as it is in flight.
 
-    Source: docs, definitions; C2 to C4 of the paper's open points.
+    Source: C2 to C4 of the paper's open points.
     """
     too_far = bound > duration - MINIMUM_STAY
     violated = [margin[:, 0] < 0 for margin in margins.values()]
@@ -64,9 +67,6 @@ def efficiency(bound: Float[np.ndarray, "N"], settling_time: Float[np.ndarray, "
     """Physical bound over the measured settling time of the position, 1; above 1 only if the speed bound was broken.
 
     0 for a trial that never settled (settling time +inf). NaN, left out, where the bound is 0 s: the trial starts
-    inside the band, or the task bounds no speed, and there is nothing to be efficient at. A settling time of 0
-    belongs to such a start, and is left out with it.
-
-    Source: docs, definitions.
+    inside the band, or the task has no speed bound. A settling time of 0 belongs to such a start.
     """
     return np.divide(bound, settling_time, out=np.full_like(bound, np.nan), where=(bound > 0) & (settling_time > 0))

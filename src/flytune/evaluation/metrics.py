@@ -1,8 +1,7 @@
 """Step-response metrics: one number per trial from its error over time, in NumPy.
 
 An error [N, K] is a value less its target: N trials of K = T + 1 samples at the control rate, the start (sample 0)
-and the end included. Its unit is the unit of the metric: m, or rad for yaw. Nothing here knows who flew, or on which
-axis.
+and the end included. Its unit is the unit of the metric: m, or rad for yaw.
 
 Source: docs, definitions.
 """
@@ -10,7 +9,7 @@ Source: docs, definitions.
 import math
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 
 from flytune.task.situation import POSITION_BAND as POSITION_BAND
 from flytune.task.situation import YAW_BAND as YAW_BAND
@@ -72,8 +71,6 @@ def settling_time(
     """First instant in s after which |error| <= band to the end of the trial; 0 if it never left; +inf unless settled.
 
     Settled means in the band from at least MINIMUM_STAY before the end. `band` may differ between trials.
-
-    Source: docs, definitions.
     """
     outside = ~(np.abs(error) <= np.reshape(band, (-1, 1)))  # so that a NaN is outside
     samples = time.size
@@ -87,13 +84,11 @@ def rise_time(error: Float[np.ndarray, "N K"], time: Float[np.ndarray, "K"]) -> 
     """Time in s from 10 % to 90 % of the step: from the first error of 0.9 to the first of 0.1 of the initial one.
 
     Measured towards the target and on samples, not interpolated. +inf if 90 % is never reached; NaN without a step.
-
-    Source: docs, definitions.
     """
     step = np.abs(error[:, :1])
     remaining = error * np.sign(error[:, :1])
     begun, arrived = remaining <= 0.9 * step, remaining <= 0.1 * step
-    elapsed = time[_first(arrived)] - time[_first(begun)]
+    elapsed = time[np.argmax(arrived, axis=1)] - time[np.argmax(begun, axis=1)]  # the first sample of each
     elapsed = np.where(arrived.any(axis=1), np.round(elapsed, 9), np.inf)  # 0.94 rather than 0.9400000000000001
     return np.where(step[:, 0] > 0, elapsed, np.nan)
 
@@ -104,8 +99,6 @@ def overshoot(error: Float[np.ndarray, "N K"], band: float = 0.0) -> Float[np.nd
         overshoot = max over t of (-e(t) sign(e(0))) / |e(0)|
 
     The band decides whether an excursion counts, and is not taken off one that does.
-
-    Source: docs, definitions.
     """
     step = np.abs(error[:, 0])
     excursion = np.max(-error * np.sign(error[:, :1]), axis=1)
@@ -163,11 +156,6 @@ def action_total_variation(action: Float[np.ndarray, "N K 4"]) -> Float[np.ndarr
 def steady_samples(time: Float[np.ndarray, "K"]) -> Bool[np.ndarray, "K"]:
     """Which samples are the last STEADY_WINDOW, its start excluded: 200 at 100 Hz; whole periods average out."""
     return time > time[-1] - STEADY_WINDOW + _half_sample(time)
-
-
-def _first(condition: Bool[np.ndarray, "N K"]) -> Int[np.ndarray, "N"]:
-    """Index of the first sample that meets the condition; 0 where none does."""
-    return np.argmax(condition, axis=1)
 
 
 def _half_sample(time: Float[np.ndarray, "K"]) -> float:

@@ -1,9 +1,8 @@
 """The response table, one row per channel, for a terminal, a page and Markdown; and the judgement in one line.
 
-Everything is written from what `Judgement.to_dict` gives, '-' where a quantile is infinite.
+All of it is written from `Judgement.to_dict`, with '-' where a quantile is infinite.
 """
 
-import dataclasses
 import math
 from collections.abc import Mapping
 from typing import Any
@@ -12,49 +11,41 @@ from flytune.tables import Column, Table, number
 
 AXES = ("x", "y", "z", "yaw")
 
-
-@dataclasses.dataclass(frozen=True)
-class _Channel:
-    """One row: a channel of a judgement, and the unit its error is written in."""
-
-    name: str
-    trials: int
-    judged: Mapping[str, Any]
-
-    @property
-    def unit(self) -> str:
-        return "deg" if self.name == "yaw" else "mm"
-
-    def error(self, level: str) -> str:
-        scale, decimals = (math.degrees(1), 2) if self.unit == "deg" else (1e3, 1)
-        return number(self.judged["steady_state_error"][level], decimals, scale)
-
-
 COLUMNS = (
-    Column("", lambda row: row.name, align="left", width=10),
-    Column("", lambda row: f"{row.judged['settled']}/{row.trials}", group="settled", width=9),
-    Column("median", lambda row: row.judged["settling_time"]["median"], group="settling time [s]", decimals=2,
-           width=11),
-    Column("p95", lambda row: row.judged["settling_time"]["p95"], group="settling time [s]", decimals=2, width=9),
-    Column("median", lambda row: row.judged["rise_time"]["median"] if "rise_time" in row.judged else "",
-           group="rise [s]", decimals=2, width=11),
-    Column("median", lambda row: row.judged["overshoot"]["median"], group="overshoot [%]", decimals=1, scale=100.0,
-           width=10),
-    Column("p95", lambda row: row.judged["overshoot"]["p95"], group="overshoot [%]", decimals=1, scale=100.0, width=6),
-    Column("median", lambda row: row.error("median"), group="   steady-state error", width=9),
-    Column("p95", lambda row: row.error("p95"), group="   steady-state error", width=10),
-    Column("", lambda row: f" {row.unit}", align="left", width=0),
+    Column("", lambda row: row["channel"], align="left", width=10),
+    Column("", lambda row: row["settled"], group="settled", width=9),
+    Column("median", lambda row: row["settling_time"]["median"], group="settling time [s]", decimals=2, width=11),
+    Column("p95", lambda row: row["settling_time"]["p95"], group="settling time [s]", decimals=2, width=9),
+    Column("median", lambda row: row["rise_time"]["median"] if "rise_time" in row else "", group="rise [s]",
+           decimals=2, width=11),
+    Column("median", lambda row: row["overshoot"]["median"], group="overshoot [%]", decimals=1, scale=100.0, width=10),
+    Column("p95", lambda row: row["overshoot"]["p95"], group="overshoot [%]", decimals=1, scale=100.0, width=6),
+    Column("median", lambda row: row["error"]["median"], group="   steady-state error", width=9),
+    Column("p95", lambda row: row["error"]["p95"], group="   steady-state error", width=10),
+    Column("", lambda row: row["unit"], align="left", width=0),
 )  # fmt: skip
+
+
+def error_unit(channel: str) -> tuple[str, float, int]:
+    """The unit in which steady-state errors of a channel are shown, its factor, and the decimals."""
+    return ("deg", math.degrees(1), 2) if channel == "yaw" else ("mm", 1e3, 1)
 
 
 def response_table(judged: Mapping[str, Any]) -> Table:
     """The response table of one judgement, one row per channel."""
-    channels = {axis: judged["axes"][axis] for axis in AXES} | {"position": judged["position"]}
-    return Table.of(COLUMNS, [_Channel(name, judged["trials"], channel) for name, channel in channels.items()])
+    channels = {**judged["axes"], "position": judged["position"]}
+    return Table.of(COLUMNS, [_row(name, channel, judged["trials"]) for name, channel in channels.items()])
+
+
+def _row(name: str, channel: Mapping[str, Any], trials: int) -> dict[str, Any]:
+    unit, scale, decimals = error_unit(name)
+    error = {level: number(value, decimals, scale) for level, value in channel["steady_state_error"].items()}
+    settled = f"{channel['settled']}/{trials}"
+    return {**channel, "channel": name, "settled": settled, "error": error, "unit": f" {unit}"}
 
 
 def response_text(judged: Mapping[str, Any]) -> str:
-    """One judgement for a terminal: what flew where, the response table, and what does not belong to one channel."""
+    """One judgement for a terminal: its conditions, the response table, and what does not belong to one channel."""
     heading = (
         f"{judged['who']} on {judged['task']} ({judged['vehicle']}, world {judged['world']}): "
         f"{judged['trials']} trials of {judged['duration']:g} s, starts {judged['starts']}, seed {judged['seed']}"

@@ -7,16 +7,14 @@ from typing import Any
 import numpy as np
 import plotly.graph_objects as go
 from jaxtyping import Float
-from plotly.subplots import make_subplots
 
 from flytune.evaluation import metrics
 from flytune.evaluation.comparison import Comparison
-from flytune.evaluation.comparison_table import WAYS, title, unit
 from flytune.evaluation.difference import METRICS, Difference
 from flytune.evaluation.flights import Flights
 from flytune.evaluation.judge import CHANNELS
 from flytune.report import plots, style
-from flytune.report.style import heading, label
+from flytune.report.style import label
 
 TRIALS_SHOWN = 3  # of each controller, the first ones; more lines than these hide each other
 FLOOR = 0.002  # of the band; an error below it is drawn there, as a logarithmic axis has no zero
@@ -34,18 +32,12 @@ BOXES = (
 
 def responses(flights: Sequence[Flights], comparison: Comparison) -> go.Figure:
     """x, y, z, yaw and distance of the same few trials of every controller, and the errors of all trials over time."""
-    figure = make_subplots(
-        len(CHANNELS),
-        2,
-        shared_xaxes="all",  # pyright: ignore[reportArgumentType]  (its stub knows booleans only)
-        vertical_spacing=0.03,
-        horizontal_spacing=0.1,
-        subplot_titles=[heading("the same few trials"), heading("error over all trials: median and middle half")],
-    )
+    titles = ["the same few trials", "error over all trials: median and middle half"]
+    figure = style.panels(5, 2, titles, shared_xaxes="all", vertical_spacing=0.03, horizontal_spacing=0.1)
     shown = min(TRIALS_SHOWN, flights[0].trials)
     opacity = 0.16 if len(flights) < 4 else 0.07  # many shades above each other only darken the picture
     for row, channel in enumerate(CHANNELS, start=1):
-        symbol = "deg" if channel == "yaw" else "m"
+        unit = plots.UNITS.get(channel, "m")
         _, target, band = _course(flights[0], channel)
         errors = []
         for index, flown in enumerate(flights):
@@ -54,19 +46,13 @@ def responses(flights: Sequence[Flights], comparison: Comparison) -> go.Figure:
         figure.add_traces(errors, rows=row, cols=2)
         plots.target_and_band(figure, row, 1, target, band)
         low, high = _reach(errors, band)
-        place: dict[str, Any] = {"row": row, "col": 2}
+        place = style.at(row, 2)
         figure.add_hrect(low / 2, band, fillcolor=style.BAND, line_width=0, layer="below", **place)
-        decades: dict[str, Any] = {
-            "type": "log",
-            "dtick": 1,
-            "exponentformat": "none",
-            "range": [math.log10(low), math.log10(high)],
-        }
-        figure.update_yaxes(title_text=f"|{channel} error| [{symbol}]", **decades, **place)
-        title_text = f"{'distance' if channel == 'position' else channel} [{symbol}]"
+        decades = {"type": "log", "dtick": 1, "exponentformat": "none", "range": [math.log10(low), math.log10(high)]}
+        figure.update_yaxes(title_text=f"|{channel} error| [{unit}]", **decades, **place)
+        title_text = f"{'distance' if channel == 'position' else channel} [{unit}]"
         figure.update_yaxes(title_text=title_text, row=row, col=1)
-    figure.update_xaxes(range=[0, flights[0].duration], hoverformat=".2f")
-    figure.update_xaxes(title_text="time [s]", row=len(CHANNELS))
+    plots.over_time(figure, flights[0], rows=5)
     return _finish(figure, comparison.names, range(len(flights)), 1000, hovermode="x")
 
 
@@ -110,54 +96,37 @@ def _trials(flights: Flights, channel: str, shown: int, index: int) -> go.Scatte
 def _errors(flights: Flights, crashed: np.ndarray, channel: str, index: int, opacity: float) -> list[go.Scatter]:
     """Median and middle half of the error over all trials; a crashed trial is infinitely far at every instant."""
     step = plots.stride(flights)
-    error = np.where(crashed[:, None], np.inf, _error(flights, channel)[:, ::step])
+    error = _error(flights, channel)[:, ::step]
+    error = np.where(crashed[:, None] | np.isnan(error), np.inf, error)
     floor = FLOOR * _course(flights, channel)[2]
-    low, middle, high = (_quantile(error, share, floor) for share in (0.25, 0.5, 0.75))
+    low, middle, high = (np.maximum(level, floor) for level in plots.quantiles(error, 0.25, 0.5, 0.75))
     colour = style.colour(index)
-    common: dict[str, Any] = {"x0": 0, "dx": step * float(flights.time[1]), "mode": "lines", "meta": index}
-    edge: dict[str, Any] = {"line": {"width": 0, "color": colour}, "hoverinfo": "skip"}
+    edge: dict[str, Any] = {"line": {"width": 0, "color": colour}, "hoverinfo": "skip", "meta": index}
     shade = f"rgba({', '.join(str(int(colour[at : at + 2], 16)) for at in (1, 3, 5))}, {opacity})"
     line = {"color": colour, "width": 1.8, "simplify": False}
     return [
-        go.Scatter(**common, **edge, y=low),
-        go.Scatter(**common, **edge, y=high, fill="tonexty", fillcolor=shade),
-        go.Scatter(**common, y=middle, line=line, hovertemplate="%{y:.4f}"),
+        plots.curve(flights, step, low, **edge),
+        plots.curve(flights, step, high, **edge, fill="tonexty", fillcolor=shade),
+        plots.curve(flights, step, middle, line=line, hovertemplate="%{y:.4f}", meta=index),
     ]
-
-
-def _quantile(error: Float[np.ndarray, "N K"], share: float, floor: float) -> Float[np.ndarray, "K"]:
-    """The error that this share of the trials does not exceed, at every instant; NaN, a gap, where it is infinite."""
-    ranked = np.sort(np.where(np.isnan(error), np.inf, error), axis=0)
-    chosen = np.maximum(ranked[max(math.ceil(share * len(ranked) - 1e-9) - 1, 0)], floor)
-    return np.where(np.isfinite(chosen), chosen, np.nan).astype(np.float32)
 
 
 def boxes(comparison: Comparison) -> go.Figure | str:
     """Box plots of each metric, the controllers side by side, with the number of trials that each box holds."""
     chosen = [metric for metric in METRICS if metric.name in BOXES]
-    figure = make_subplots(
-        2, 4, vertical_spacing=0.2, horizontal_spacing=0.07, subplot_titles=[heading(title(one)) for one in chosen]
-    )
+    titles = [metric.title for metric in chosen]
+    figure = style.panels(2, 4, titles, vertical_spacing=0.2, horizontal_spacing=0.07)
     drawn = 0
     for panel, metric in enumerate(chosen):
         row, column = divmod(panel, 4)
-        symbol, scale = unit(metric)
-        ticks = []
-        for index, judgement in enumerate(comparison.judgements):
-            values = metric.values(judgement)
-            finite = values[np.isfinite(values)] * scale
-            drawn += finite.size
-            ticks.append(f"<b>{index + 1}</b><br>{finite.size}")
-            trace = plots.box(finite, index, "", style.colour(index))
-            trace.update(meta=index)
-            figure.add_trace(trace, row=row + 1, col=column + 1)
-        place: dict[str, Any] = {"row": row + 1, "col": column + 1}
-        count = len(comparison.judgements)
-        figure.update_xaxes(tickvals=list(range(count)), ticktext=ticks, range=[-0.6, count - 0.4], **place)
-        figure.update_yaxes(title_text=f"[{symbol}]", rangemode="tozero", **place)
+        unit, scale = metric.shown
+        side_by_side = [
+            (metric.values(judgement) * scale, style.colour(index), f"<b>{index + 1}</b><br>{{}}", {"meta": index})
+            for index, judgement in enumerate(comparison.judgements)
+        ]
+        drawn += plots.draw_boxes(figure, style.at(row + 1, column + 1), f"[{unit}]", side_by_side)
     if not drawn:
         return "Every trial of every controller crashed, so there is nothing to draw."
-    figure.update_xaxes(showgrid=False, tickangle=0, tickfont_size=11)
     return _finish(figure, comparison.names, range(len(comparison.names)), 580)
 
 
@@ -168,19 +137,15 @@ def paired(comparison: Comparison) -> go.Figure:
     others = [index for index in range(len(comparison.names)) if index != comparison.reference]
     gap = 92  # px between the panels of a column, for ticks and titles
     height = rows * (38 + 24 * len(others)) + (rows - 1) * gap
-    figure = make_subplots(
-        rows,
-        columns,
-        vertical_spacing=gap / height,
-        horizontal_spacing=0.05,
-        subplot_titles=[heading(title(metric)) for metric in METRICS],
-    )
+    titles = [metric.title for metric in METRICS]
+    figure = style.panels(rows, columns, titles, vertical_spacing=gap / height, horizontal_spacing=0.05)
     for panel, metric in enumerate(METRICS):
-        row, column = (number + 1 for number in divmod(panel, columns))
+        row, column = divmod(panel, columns)
+        place = style.at(row + 1, column + 1)
         found = [one for one in comparison.differences if one.metric is metric]
-        _draw_differences(figure, found, others, row, column)
-        more, less = WAYS[metric.field]
-        figure.update_xaxes(title_text=f"← {less}  [{unit(metric)[0]}]  {more} →", row=row, col=column)
+        _draw_differences(figure, found, others, place)
+        more, less = metric.ways
+        figure.update_xaxes(title_text=f"← {less}  [{metric.shown[0]}]  {more} →", **place)
     ticks = {"tickvals": list(range(len(others))), "ticktext": [f"<b>{index + 1}</b>" for index in others]}
     figure.update_yaxes(**ticks, range=[len(others) - 0.4, -0.6])
     figure.update_xaxes(nticks=5, tickfont_size=11, exponentformat="none")
@@ -191,42 +156,29 @@ def paired(comparison: Comparison) -> go.Figure:
 
 
 def _draw_differences(
-    figure: go.Figure, differences: Sequence[Difference], controllers: Sequence[int], row: int, column: int
+    figure: go.Figure, differences: Sequence[Difference], controllers: Sequence[int], place: dict[str, Any]
 ) -> None:
     """One panel: a dot and its interval per controller; what is infinite stands as a triangle at the edge."""
-    _, scale = unit(differences[0].metric)
+    _, scale = differences[0].metric.shown
     ends = np.array([[one.low, one.median, one.high] for one in differences]) * scale
     known = np.append(ends[np.isfinite(ends)], 0.0)
     spread = float(np.ptp(known)) or 1.0
     left, right = float(known.min()) - 0.18 * spread, float(known.max()) + 0.18 * spread
-    place: dict[str, Any] = {"row": row, "col": column}
     for height, (controller, difference, three) in enumerate(zip(controllers, differences, ends, strict=True)):
         low, middle, high = np.clip(three, left, right)
         colour = style.colour(controller)
         symbol = "circle" if np.isfinite(three[1]) else f"triangle-{'right' if three[1] > 0 else 'left'}"
-        bar = go.Scatter(
-            x=[low, high],
-            y=[height, height],
-            mode="lines",
-            line={"color": colour, "width": 3},
-            hoverinfo="skip",
-            meta=controller,
-        )
-        dot = go.Scatter(
-            x=[middle],
-            y=[height],
-            mode="markers",
-            marker={"color": colour, "size": 10, "symbol": symbol, "line": {"color": "white", "width": 1}},
-            cliponaxis=False,
-            hovertemplate=_told(difference, three),
-            meta=controller,
-        )
-        figure.add_traces([bar, dot], rows=row, cols=column)
+        line = {"color": colour, "width": 3}
+        bar = go.Scatter(x=[low, high], y=[height, height], mode="lines", line=line, hoverinfo="skip", meta=controller)
+        marker = {"color": colour, "size": 10, "symbol": symbol, "line": {"color": "white", "width": 1}}
+        dot = go.Scatter(x=[middle], y=[height], mode="markers", marker=marker, cliponaxis=False, meta=controller)
+        figure.add_trace(bar, **place)
+        figure.add_trace(dot.update(hovertemplate=_hover(difference, three)), **place)
     figure.update_xaxes(range=[left, right], **place)
 
 
-def _told(difference: Difference, ends: Float[np.ndarray, "3"]) -> str:
-    """What a dot says when it is pointed at."""
+def _hover(difference: Difference, ends: Float[np.ndarray, "3"]) -> str:
+    """The text that is shown when somebody points at a dot."""
     low, middle, high = (f"{end:.4g}" for end in ends)
     return (
         f"{middle} ({low} to {high})<br>smaller in {difference.better}, larger in {difference.worse}, "
@@ -248,7 +200,7 @@ def _finish(
         marker = {"color": style.colour(controller), "symbol": "square", "size": 11}
         entry = go.Scatter(x=[None], y=[None], mode="markers", marker=marker, name=texts[controller], hoverinfo="skip")
         figure.add_trace(entry.update(legendgroup=str(controller)))
-    margin = {"l": 66, "r": 14, "t": style.room_for_names(len(controllers)), "b": 48}
-    figure = style.frame(figure, height + margin["t"] + margin["b"], margin=margin, **layout)
+    above = style.room_for_names(len(controllers))
+    figure = style.frame(figure, height + above + 48, margin={"t": above}, **layout)
     figure.update_annotations(font_size=11.5)  # titles of four panels side by side
     return style.legend_below_tools(figure)

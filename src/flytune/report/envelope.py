@@ -1,4 +1,4 @@
-"""Figures of where flights were: how much of each bound they left, and their paths in space."""
+"""Figures of the space that flights use: the margin to each bound, and the paths."""
 
 import math
 from collections.abc import Mapping
@@ -7,15 +7,15 @@ from typing import Any
 import numpy as np
 import plotly.graph_objects as go
 from jaxtyping import Float
-from plotly.subplots import make_subplots
 
 from flytune.evaluation.flights import Flights
 from flytune.evaluation.judge import Judgement
 from flytune.report import style
-from flytune.report.plots import TRIALS_SHOWN, stride
-from flytune.report.style import heading, label
+from flytune.report.plots import TRIALS_SHOWN, curve, quantiles, stride
+from flytune.report.style import label
 
 TRIALS_BEHIND = 100  # more lines than these only blacken the picture in 3-D
+HOVER = "%{x:.2f}, %{y:.2f}, %{z:.2f} m"
 
 
 def margins(flights: Flights, judgement: Judgement) -> go.Figure | str:
@@ -24,17 +24,16 @@ def margins(flights: Flights, judgement: Judgement) -> go.Figure | str:
         return "The task has no termination condition, so there is no margin to draw."
     names = sorted(flights.margins, key=lambda name: _tightness(flights.margins[name]))
     columns, rows = min(3, len(names)), math.ceil(len(names) / 3)
-    titles = [
-        f"{heading(label(name, 26))}<br>crossed in {np.count_nonzero(judgement.violated[name])} of {flights.trials}"
-        for name in names
-    ]
-    figure = make_subplots(
-        rows, columns, shared_xaxes=True, vertical_spacing=0.32 / rows, horizontal_spacing=0.07, subplot_titles=titles
+    crossed = {name: np.count_nonzero(judgement.violated[name]) for name in names}
+    titles = [f"{label(name, 26)}<br>crossed in {crossed[name]} of {flights.trials}" for name in names]
+    figure = style.panels(
+        rows, columns, titles, shared_xaxes=True, vertical_spacing=0.32 / rows, horizontal_spacing=0.07
     )
     drawn = []
     for index, name in enumerate(names):
         row, column = divmod(index, columns)
-        drawn.append(_draw_margin(figure, flights, flights.margins[name], row + 1, column + 1, legend=index == 0))
+        place = style.at(row + 1, column + 1)
+        drawn.append(_draw_margin(figure, flights, flights.margins[name], place, legend=index == 0))
     figure.update_xaxes(range=[0, flights.duration], hoverformat=".2f", showticklabels=True)
     for column in range(columns):
         last = max(range(column, len(names), columns)) // columns + 1
@@ -42,49 +41,32 @@ def margins(flights: Flights, judgement: Judgement) -> go.Figure | str:
     lowest = min(float(np.nanmin(levels, initial=0.0)) for levels in drawn)
     figure.update_yaxes(range=[max(lowest, -100.0) - 5, 102])
     figure.update_yaxes(title_text="margin [% of bound]", col=1)
-    return style.frame(figure, 110 + 240 * rows, hovermode="x", margin={"l": 66, "r": 14, "t": 86, "b": 48})
+    return style.frame(figure, 110 + 240 * rows, margin={"t": 86}, hovermode="x")
 
 
 def _tightness(margin: Float[np.ndarray, "N K"]) -> float:
-    """What the median trial left of a bound at its worst instant: the smaller, the more the bound holds back."""
+    """The margin of the median trial at its worst instant: the smaller, the more the bound limits the flights."""
     return float(np.median(np.where(np.isfinite(margin), margin, -np.inf).min(axis=1)))
 
 
 def _draw_margin(
-    figure: go.Figure, flights: Flights, margin: Float[np.ndarray, "N K"], row: int, column: int, legend: bool
+    figure: go.Figure, flights: Flights, margin: Float[np.ndarray, "N K"], place: dict[str, Any], legend: bool
 ) -> list[Float[np.ndarray, "drawn"]]:
-    """Draw a panel; what comes back are its curves, from the smallest to the largest margin."""
+    """The curves of a panel, which are drawn, from the smallest to the largest margin."""
     step = 2 * stride(flights)
-    levels = _percentiles(100.0 * np.minimum(margin[:, ::step], 1.0), (0, 5, 50, 95, 100))  # altitudes may have more
-    common: dict[str, Any] = {"x0": 0, "dx": step * float(flights.time[1]), "mode": "lines", "showlegend": False}
-    edge = {"width": 0, "color": style.AXES["x"]}
+    percent = 100.0 * np.minimum(margin[:, ::step], 1.0)  # altitudes may have more
+    # a margin that is not finite belongs to a lost trial, and counts as the worst
+    levels = quantiles(np.where(np.isfinite(percent), percent, -np.inf), 0.0, 0.05, 0.5, 0.95, 1.0)
+    edge: dict[str, Any] = {"line": {"width": 0, "color": style.AXES["x"]}, "hoverinfo": "skip"}
     for low, high, opacity, name in ((0, 4, 0.13, "smallest to largest"), (1, 3, 0.22, "p5 to p95")):
-        figure.add_trace(go.Scatter(**common, y=levels[low], line=edge, hoverinfo="skip"), row=row, col=column)
-        band = go.Scatter(
-            **{**common, "showlegend": legend},
-            y=levels[high],
-            line=edge,
-            fill="tonexty",
-            fillcolor=f"rgba(11, 95, 165, {opacity})",
-            name=name,
-            hoverinfo="skip",
-        )
-        figure.add_trace(band, row=row, col=column)
+        shade = {"fill": "tonexty", "fillcolor": f"rgba(11, 95, 165, {opacity})", "name": name}
+        figure.add_trace(curve(flights, step, levels[low], **edge, showlegend=False), **place)
+        figure.add_trace(curve(flights, step, levels[high], **edge, **shade, showlegend=legend), **place)
     line = {"color": style.AXES["x"], "width": 1.5}
-    median = go.Scatter(
-        **{**common, "showlegend": legend}, y=levels[2], line=line, name="median", hovertemplate="%{y:.0f} %"
-    )
-    figure.add_trace(median, row=row, col=column)
-    place: dict[str, Any] = {"row": row, "col": column}
+    median = {"line": line, "name": "median", "hovertemplate": "%{y:.0f} %", "showlegend": legend}
+    figure.add_trace(curve(flights, step, levels[2], **median), **place)
     figure.add_hline(0, line={"color": style.BOUND, "width": 1}, **place)
     return levels
-
-
-def _percentiles(values: Float[np.ndarray, "N K"], levels: tuple[int, ...]) -> list[Float[np.ndarray, "K"]]:
-    """Percentiles over the trials; a margin that is not finite belongs to a lost trial and counts as the worst."""
-    counted = np.sort(np.where(np.isfinite(values), values, -np.inf), axis=0)
-    chosen = [counted[max(math.ceil(level / 100 * len(counted)) - 1, 0)] for level in levels]
-    return [np.where(np.isfinite(level), level, np.nan).astype(np.float32) for level in chosen]
 
 
 def flights_3d(flights: Flights) -> go.Figure:
@@ -113,31 +95,15 @@ def flights_3d(flights: Flights) -> go.Figure:
 
 def _path(points: Float[np.ndarray, "M 3"], colour: str, width: float, name: str, group: str = "") -> go.Scatter3d:
     x, y, z = points.T.astype(np.float32)
-    return go.Scatter3d(
-        x=x,
-        y=y,
-        z=z,
-        mode="lines",
-        line={"color": colour, "width": width},
-        name=name,
-        legendgroup=group,
-        hovertemplate="%{x:.2f}, %{y:.2f}, %{z:.2f} m" if group else None,
-        hoverinfo=None if group else "skip",
-    )
+    options = {"line": {"color": colour, "width": width}, "name": name, "legendgroup": group}
+    hover = {"hovertemplate": HOVER} if group else {"hoverinfo": "skip"}
+    return go.Scatter3d(x=x, y=y, z=z, mode="lines", **options, **hover)
 
 
 def _mark(
     point: Float[np.ndarray, "3"], colour: str, symbol: str, name: str, group: str, legend: bool = False
 ) -> go.Scatter3d:
     x, y, z = ([float(value)] for value in point)
-    return go.Scatter3d(
-        x=x,
-        y=y,
-        z=z,
-        mode="markers",
-        marker={"color": colour, "size": 5, "symbol": symbol},
-        name=name,
-        legendgroup=group,
-        showlegend=legend,
-        hovertemplate="%{x:.2f}, %{y:.2f}, %{z:.2f} m",
-    )
+    marker = {"color": colour, "size": 5, "symbol": symbol}
+    options = {"name": name, "legendgroup": group, "showlegend": legend, "hovertemplate": HOVER}
+    return go.Scatter3d(x=x, y=y, z=z, mode="markers", marker=marker, **options)

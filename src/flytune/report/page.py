@@ -55,7 +55,7 @@ def _environment() -> jinja2.Environment:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.globals.update(asset=_asset, plotly=_plotly)
+    environment.globals.update(asset=_asset, plotly=functools.cache(lambda: pack(get_plotlyjs())))
     environment.filters["packed"] = lambda plot: pack(plot.to_json(validate=False))
     environment.filters["base64"] = lambda text: base64.b64encode(text.encode()).decode()
     environment.tests["in_space"] = lambda plot: any(trace.type == "scatter3d" for trace in plot.data)
@@ -68,12 +68,6 @@ def _asset(name: str) -> Markup:
     return Markup((resources.files("flytune.report") / "assets" / name).read_text(encoding="utf-8"))
 
 
-@functools.cache
-def _plotly() -> str:
-    """plotly.js, packed."""
-    return pack(get_plotlyjs())
-
-
 def pack(text: str) -> str:
-    """A text compressed, in letters that need no escaping in HTML; `page.js` unpacks it."""
+    """A text, compressed, in characters that need no escaping in HTML; `page.js` unpacks it."""
     return base64.b64encode(gzip.compress(text.encode(), mtime=0)).decode()

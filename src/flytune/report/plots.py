@@ -7,13 +7,13 @@ from typing import Any
 import numpy as np
 import plotly.graph_objects as go
 from jaxtyping import Float
-from plotly.subplots import make_subplots
 
 from flytune.evaluation import metrics
 from flytune.evaluation.flights import Flights
 from flytune.evaluation.judge import AXES, Judgement
+from flytune.evaluation.statistics import ranked
 from flytune.report import style
-from flytune.report.style import heading, label
+from flytune.report.style import label
 from flytune.task.task import Task
 from flytune.task.termination import MinimumAltitude
 
@@ -25,29 +25,23 @@ UNITS = {"x": "m", "y": "m", "z": "m", "yaw": "deg"}
 
 def response(flights: Flights, judgement: Judgement, task: Task) -> go.Figure:
     """x, y, z and yaw of the first trials against time, with a close-up of the last bands before the target."""
-    figure = make_subplots(
-        len(AXES),
-        2,
-        shared_xaxes="all",  # pyright: ignore[reportArgumentType]  (its stub knows booleans only)
-        vertical_spacing=0.04,
-        horizontal_spacing=0.09,
-        subplot_titles=[heading("whole flight"), heading(f"close-up: the target ± {BANDS_IN_CLOSE_UP} bands")],
-    )
+    titles = ["whole flight", f"close-up: the target ± {BANDS_IN_CLOSE_UP} bands"]
+    figure = style.panels(4, 2, titles, shared_xaxes="all", vertical_spacing=0.04, horizontal_spacing=0.09)
     for row, axis in enumerate(AXES, start=1):
         values, target, band = course(flights, axis)
         for column in (1, 2):
             for trial in range(min(TRIALS_SHOWN, flights.trials)):
-                curve = _curve(flights, judgement, values[trial], trial, legend=(row, column) == (1, 1))
-                figure.add_trace(curve, row=row, col=column)
-                figure.add_trace(_settled_dot(flights, values, judgement, axis, trial), row=row, col=column)
+                line = _trial(flights, judgement, values, trial, legend=(row, column) == (1, 1))
+                dot = _settled_dot(flights, judgement, values, trial, axis)
+                figure.add_traces([line, dot], rows=row, cols=column)
             target_and_band(figure, row, column, target, band)
         wide = BANDS_IN_CLOSE_UP * band
         figure.update_yaxes(title_text=f"{axis} [{UNITS[axis]}]", row=row, col=1)
         figure.update_yaxes(range=[target - wide, target + wide], row=row, col=2)
     for end in task.termination.values():
         if isinstance(end, MinimumAltitude):
-            _bound(figure, float(end.bound), row=AXES.index("z") + 1, col=1)
-    return _over_time(figure, flights, rows=len(AXES), height=760)
+            _bound(figure, float(end.bound), row=AXES.index("z") + 1, column=1)
+    return style.frame(over_time(figure, flights, rows=4), 760, hovermode="x")
 
 
 def motion(flights: Flights, judgement: Judgement) -> go.Figure:
@@ -58,34 +52,27 @@ def motion(flights: Flights, judgement: Judgement) -> go.Figure:
     left += [(f"rate {axis} [deg/s]", rates[..., index]) for index, axis in enumerate("xyz")]
     right = [(f"motor {motor + 1} [1]", action[..., motor]) for motor in range(action.shape[-1])]
     right += [("speed [m/s]", np.linalg.norm(flights.velocity, axis=-1))]
-    figure = make_subplots(
-        len(left),
-        2,
-        shared_xaxes="all",  # pyright: ignore[reportArgumentType]
-        vertical_spacing=0.03,
-        horizontal_spacing=0.09,
-        subplot_titles=[heading("tilt and body rates"), heading("motor commands and speed")],
-    )
+    titles = ["tilt and body rates", "motor commands and speed"]
+    figure = style.panels(5, 2, titles, shared_xaxes="all", vertical_spacing=0.03, horizontal_spacing=0.09)
     for column, panels in enumerate((left, right), start=1):
         for row, (title, values) in enumerate(panels, start=1):
             for trial in range(min(TRIALS_SHOWN, flights.trials)):
-                curve = _curve(flights, judgement, values[trial], trial, legend=(row, column) == (1, 1))
-                figure.add_trace(curve, row=row, col=column)
+                line = _trial(flights, judgement, values, trial, legend=(row, column) == (1, 1))
+                figure.add_trace(line, row=row, col=column)
             figure.update_yaxes(title_text=title, row=row, col=column)
             if title.startswith("motor"):
                 figure.update_yaxes(range=[-1.05, 1.05], row=row, col=column)
-    figure.update_yaxes(rangemode="tozero", row=len(right), col=2)
+    figure.update_yaxes(rangemode="tozero", row=5, col=2)
     if flights.speed_bound is not None:
         text = {"text": f"bound {flights.speed_bound:g} m/s", "font": {"color": style.BOUND}}
-        _bound(figure, flights.speed_bound, len(right), 2, annotation=text, annotation_position="bottom right")
-    return _over_time(figure, flights, rows=len(left), height=860)
+        _bound(figure, flights.speed_bound, 5, 2, annotation=text, annotation_position="bottom right")
+    return style.frame(over_time(figure, flights, rows=5), 860, hovermode="x")
 
 
-def _over_time(figure: go.Figure, flights: Flights, rows: int, height: int) -> go.Figure:
-    """The figure in the house style, its panels over the time of the flights."""
+def over_time(figure: go.Figure, flights: Flights, rows: int) -> go.Figure:
+    """The figure, its panels over the time of the flights, which stands under the last row."""
     figure.update_xaxes(range=[0, flights.duration], hoverformat=".2f")
-    figure.update_xaxes(title_text="time [s]", row=rows)
-    return style.frame(figure, height, hovermode="x")
+    return figure.update_xaxes(title_text="time [s]", row=rows)
 
 
 def _tilt(attitude: Float[np.ndarray, "N K 4"]) -> tuple[Float[np.ndarray, "N K"], Float[np.ndarray, "N K"]]:
@@ -96,14 +83,25 @@ def _tilt(attitude: Float[np.ndarray, "N K 4"]) -> tuple[Float[np.ndarray, "N K"
         return np.degrees(roll), np.degrees(np.arcsin(np.clip(2 * (w * y - z * x), -1, 1)))
 
 
-def _bound(figure: go.Figure, value: float, row: int, col: int, **options: Any) -> None:
-    place: dict[str, Any] = {"row": row, "col": col}
-    figure.add_hline(value, line={"color": style.BOUND, "width": 1}, **options, **place)
+def _bound(figure: go.Figure, value: float, row: int, column: int, **options: Any) -> None:
+    figure.add_hline(value, line={"color": style.BOUND, "width": 1}, **options, **style.at(row, column))
 
 
 def stride(flights: Flights) -> int:
-    """Every how many samples a curve has a point."""
+    """The number of samples from one point of a curve to the next."""
     return max(1, flights.time.size // POINTS)
+
+
+def curve(flights: Flights, step: int, values: Float[np.ndarray, "points"], **options: Any) -> go.Scatter:
+    """A line over time through every `step`-th sample."""
+    dx = step * float(flights.time[1])
+    return go.Scatter(x0=0, dx=dx, y=values.astype(np.float32), mode="lines", **options)
+
+
+def quantiles(values: Float[np.ndarray, "N K"], *shares: float) -> list[Float[np.ndarray, "K"]]:
+    """Quantiles over the trials at every instant, see `ranked`; NaN, a gap in a curve, where one is infinite."""
+    found = (ranked(values, share) for share in shares)
+    return [np.where(np.isfinite(level), level, np.nan).astype(np.float32) for level in found]
 
 
 def course(flights: Flights, axis: str) -> tuple[Float[np.ndarray, "N K"], float, float]:
@@ -116,19 +114,17 @@ def course(flights: Flights, axis: str) -> tuple[Float[np.ndarray, "N K"], float
     return np.degrees(error + flights.target_yaw), math.degrees(flights.target_yaw), math.degrees(metrics.YAW_BAND)
 
 
-def _curve(
-    flights: Flights, judgement: Judgement, values: Float[np.ndarray, "K"], trial: int, legend: bool
+def _trial(
+    flights: Flights, judgement: Judgement, values: Float[np.ndarray, "N K"], trial: int, legend: bool
 ) -> go.Scatter:
     """One trial over time, dotted where it crashed."""
-    crashed = bool(judgement.crashed[trial])
-    step = stride(flights)
-    color, dash = style.TRIALS[trial], "dot" if crashed else "solid"
-    return go.Scatter(
-        x0=0,
-        dx=step * float(flights.time[1]),
-        y=values[::step].astype(np.float32),
-        mode="lines",
-        line={"color": color, "width": 1.3, "dash": dash, "simplify": False},
+    crashed, step = bool(judgement.crashed[trial]), stride(flights)
+    dash = "dot" if crashed else "solid"
+    return curve(
+        flights,
+        step,
+        values[trial, ::step],
+        line={"color": style.TRIALS[trial], "width": 1.3, "dash": dash, "simplify": False},
         name=f"trial {trial + 1}" + (" (crashed)" if crashed else ""),
         legendgroup=str(trial),
         showlegend=legend,
@@ -136,14 +132,15 @@ def _curve(
     )
 
 
-def _settled_dot(flights: Flights, values: np.ndarray, judgement: Judgement, axis: str, trial: int) -> go.Scatter:
+def _settled_dot(flights: Flights, judgement: Judgement, values: np.ndarray, trial: int, axis: str) -> go.Scatter:
     """A dot on the curve at the settling time; invisible where the trial did not settle."""
-    instant = judgement.settling_time[axis][trial]
-    settled = np.isfinite(instant)
-    sample = int(np.argmin(np.abs(flights.time - instant))) if settled else 0
+    instant = float(judgement.settling_time[axis][trial])
+    x = y = None
+    if math.isfinite(instant):
+        x, y = instant, float(values[trial, np.argmin(np.abs(flights.time - instant))])
     return go.Scatter(
-        x=[float(instant) if settled else None],
-        y=[float(values[trial, sample]) if settled else None],
+        x=[x],
+        y=[y],
         mode="markers",
         marker={"color": style.TRIALS[trial], "size": 6, "line": {"color": "white", "width": 1}},
         name=f"trial {trial + 1}",
@@ -155,7 +152,7 @@ def _settled_dot(flights: Flights, values: np.ndarray, judgement: Judgement, axi
 
 def target_and_band(figure: go.Figure, row: int, column: int, target: float, band: float) -> None:
     """Draw the target and the settling band behind the curves of a panel."""
-    place: dict[str, Any] = {"row": row, "col": column}
+    place = style.at(row, column)
     figure.add_hrect(target - band, target + band, fillcolor=style.BAND, line_width=0, layer="below", **place)
     figure.add_hline(target, line={"color": style.QUIET, "width": 1, "dash": "dash"}, layer="below", **place)
 
@@ -168,53 +165,64 @@ def spread(judgement: Judgement) -> go.Figure | str:
         ("steady-state error", "error [mm]", ("x", "y", "z"), judgement.steady_state_error, 1e3),
         ("", "error [deg]", ("yaw",), judgement.steady_state_error, math.degrees(1)),
     )
-    figure = make_subplots(
-        1,
-        len(panels),
-        column_widths=[0.31, 0.31, 0.24, 0.14],
-        horizontal_spacing=0.07,
-        subplot_titles=[heading(title) for title, *_ in panels],
-    )
+    titles = [title for title, *_ in panels]
+    figure = style.panels(1, 4, titles, column_widths=[0.31, 0.31, 0.24, 0.14], horizontal_spacing=0.07)
     drawn = 0
     for column, (_, unit, axes, values, scale) in enumerate(panels, start=1):
-        ticks = []
-        for place, axis in enumerate(axes):
-            finite = values[axis][np.isfinite(values[axis])] * scale
-            drawn += finite.size
-            ticks.append(f"{axis}<br>{finite.size}/{judgement.trials}")
-            figure.add_trace(box(finite, place, axis, style.AXES[axis]), row=1, col=column)
-        figure.update_xaxes(tickvals=list(range(len(axes))), ticktext=ticks, range=[-0.6, len(axes) - 0.4], col=column)
-        figure.update_yaxes(title_text=unit, rangemode="tozero", col=column)
+        of_all = f"<br>{{}}/{judgement.trials}"
+        boxes = [(values[axis] * scale, style.AXES[axis], axis + of_all, {"name": axis}) for axis in axes]
+        drawn += draw_boxes(figure, style.at(1, column), unit, boxes)
     if not drawn:
         return "Every trial crashed, so there is no settling time, overshoot or steady-state error to draw."
-    figure.update_xaxes(showgrid=False, tickangle=0, tickfont_size=11)
-    return style.frame(figure, 430, showlegend=False, margin={"l": 66, "r": 14, "t": 40, "b": 56})
+    return style.frame(figure, 430, showlegend=False, margin={"t": 40, "b": 56})
 
 
-def box(values: Float[np.ndarray, "M"], place: int, name: str, colour: str) -> go.Box:
-    """A box with all its values as dots, standing at the place on the x axis."""
-    return go.Box(
-        x=np.full(values.size, place, dtype=np.int8),
-        y=values.astype(np.float32),
-        name=name,
-        width=0.55,
-        boxpoints="all",
-        jitter=0.6,
-        pointpos=0,
-        line={"color": colour, "width": 1.3},
-        fillcolor="rgba(0, 0, 0, 0)",
-        marker={"color": colour, "size": 3.5, "opacity": 0.35},
-        hoverinfo="y",
-        yhoverformat=".3f",
-    )
+def draw_boxes(
+    figure: go.Figure,
+    place: dict[str, Any],
+    unit: str,
+    boxes: Sequence[tuple[Float[np.ndarray, "N"], str, str, dict[str, Any]]],
+) -> int:
+    """The number of values drawn: boxes side by side in a panel, each with all its values as dots.
+
+    Args:
+        figure: with the panel.
+        place: of the panel, see `style.at`.
+        unit: of the values.
+        boxes: of each box: values, of which those that are finite are drawn; colour; text below it, with {} for the
+            number of values drawn; further options of the trace.
+    """
+    ticks, drawn = [], 0
+    for number, (values, colour, text, options) in enumerate(boxes):
+        finite = values[np.isfinite(values)].astype(np.float32)
+        drawn += finite.size
+        ticks.append(text.format(finite.size))
+        box = go.Box(
+            x=np.full(finite.size, number, dtype=np.int8),
+            y=finite,
+            width=0.55,
+            boxpoints="all",
+            jitter=0.6,
+            pointpos=0,
+            line={"color": colour, "width": 1.3},
+            fillcolor="rgba(0, 0, 0, 0)",
+            marker={"color": colour, "size": 3.5, "opacity": 0.35},
+            hoverinfo="y",
+            yhoverformat=".3f",
+            **options,
+        )
+        figure.add_trace(box, **place)
+    ends = [-0.6, len(boxes) - 0.4]
+    look = {"showgrid": False, "tickangle": 0, "tickfont_size": 11}
+    figure.update_xaxes(tickvals=list(range(len(boxes))), ticktext=ticks, range=ends, **look, **place)
+    figure.update_yaxes(title_text=unit, rangemode="tozero", **place)
+    return drawn
 
 
-def settled_share(judgements: Sequence[tuple[str, Judgement]]) -> go.Figure:
-    """Share of all trials that have settled by each instant, per axis, one line per policy: no trial is left out."""
-    figure = make_subplots(
-        1, len(AXES), shared_yaxes=True, horizontal_spacing=0.025, subplot_titles=[heading(axis) for axis in AXES]
-    )
-    for index, (name, judgement) in enumerate(judgements):
+def settled_share(judgements: Sequence[Judgement]) -> go.Figure:
+    """Share of all trials that have settled by each instant, per axis, one line per controller: none is left out."""
+    figure = style.panels(1, 4, AXES, shared_yaxes=True, horizontal_spacing=0.025)
+    for index, judgement in enumerate(judgements):
         for column, axis in enumerate(AXES, start=1):
             settling = judgement.settling_time[axis]
             instants = np.sort(settling[np.isfinite(settling)])
@@ -224,15 +232,14 @@ def settled_share(judgements: Sequence[tuple[str, Judgement]]) -> go.Figure:
                 y=np.append(share, share[-1]).astype(np.float32),
                 mode="lines",
                 line={"shape": "hv", "width": 1.6, "color": style.colour(index)},
-                name=label(name),
+                name=label(f"{index + 1} {judgement.name}"),
                 legendgroup=str(index),
                 showlegend=column == 1,
                 hovertemplate="%{y:.0f} % by %{x:.2f} s",
             )
             figure.add_trace(line, row=1, col=column)
-    longest = max(judgement.duration for _, judgement in judgements)
-    figure.update_xaxes(title_text="time [s]", range=[0, longest])
+    figure.update_xaxes(title_text="time [s]", range=[0, max(judgement.duration for judgement in judgements)])
     figure.update_yaxes(range=[-2, 103])
     figure.update_yaxes(title_text="settled [% of trials]", col=1)
     above = style.room_for_names(len(judgements))
-    return style.legend_below_tools(style.frame(figure, 300 + above, margin={"l": 66, "r": 14, "t": above, "b": 48}))
+    return style.legend_below_tools(style.frame(figure, 300 + above, margin={"t": above}))

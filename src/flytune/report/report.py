@@ -30,13 +30,9 @@ SAME_PLACE = 1e-4  # m; another simulator may round the start, which is metres a
 def write_report(path: Path, evaluations: Sequence[Evaluation], comparison: Comparison | None = None) -> None:
     """Write the report of one or several controllers as one HTML file, whole or not at all.
 
-    Several controllers are compared first, then each has its section.
-
-    Args:
-        path: the file; one that is there is replaced.
-        evaluations: the controllers, 1 or more, in the order of the page.
-        comparison: of their judgements, in the same order. Where None, controllers that flew the same trials are
-            compared with the first one; for others, the page says why there are no paired differences.
+    Several controllers are compared first, then each has its section. `comparison` is that of their judgements, in the
+    same order. Where None, controllers that flew the same trials are compared with the first one; for others, the page
+    says why there are no paired differences.
 
     Raises:
         BadInput: no controller, a comparison of other controllers or other trials, or the file cannot be written.
@@ -45,23 +41,29 @@ def write_report(path: Path, evaluations: Sequence[Evaluation], comparison: Comp
         raise BadInput(
             "report: no controller. Allowed: one or more. Name a run directory, a policy file or a controller."
         )
-    compared: Comparison | str = comparison or "One controller is compared with no other."
+    different = ""  # why the controllers cannot be compared trial by trial
     if comparison:
         _check_same_trials(evaluations, comparison)
     elif len(evaluations) > 1:
         try:
-            compared = compare([evaluation.judgement for evaluation in evaluations])
-            _check_same_trials(evaluations, compared)
+            comparison = compare([evaluation.judgement for evaluation in evaluations])
+            _check_same_trials(evaluations, comparison)
         except BadInput as reason:
-            compared = f"There are no paired differences, since the controllers flew different trials ({reason})"
-    named = isinstance(compared, Comparison)
-    names = compared.names if named else [evaluation.name for evaluation in evaluations]
-    controllers = [_controller(name, evaluation) for name, evaluation in zip(names, evaluations, strict=True)]
-    several = _comparison(names, evaluations, compared) if len(evaluations) > 1 else None
+            comparison = None
+            different = f"There are no paired differences, since the controllers flew different trials ({reason})"
+    names = comparison.names if comparison else [evaluation.name for evaluation in evaluations]
+    evaluations = [
+        dataclasses.replace(one, name=name, judgement=dataclasses.replace(one.judgement, name=name))
+        for name, one in zip(names, evaluations, strict=True)
+    ]
     write_page(
-        path, "report.html", controllers=controllers, several=several,
-        position_band=metrics.POSITION_BAND, yaw_band=np.degrees(metrics.YAW_BAND),
-    )  # fmt: skip
+        path,
+        "report.html",
+        controllers=[_controller(evaluation) for evaluation in evaluations],
+        several=_comparison(evaluations, comparison, different) if len(evaluations) > 1 else None,
+        position_band=metrics.POSITION_BAND,
+        yaw_band=np.degrees(metrics.YAW_BAND),
+    )
 
 
 def _check_same_trials(evaluations: Sequence[Evaluation], comparison: Comparison) -> None:
@@ -80,11 +82,11 @@ def _check_same_trials(evaluations: Sequence[Evaluation], comparison: Comparison
             )
 
 
-def _controller(name: str, evaluation: Evaluation) -> dict[str, Any]:
+def _controller(evaluation: Evaluation) -> dict[str, Any]:
     """What the section of one controller shows."""
     flights, judgement = evaluation.flights, evaluation.judgement
     return {
-        "name": name,
+        "name": evaluation.name,
         "judgement": judgement,
         "summary": words.summary(judgement),
         "table": response_table(judgement.to_dict()),
@@ -101,27 +103,24 @@ def _controller(name: str, evaluation: Evaluation) -> dict[str, Any]:
     }
 
 
-def _comparison(names: Sequence[str], evaluations: Sequence[Evaluation], compared: Comparison | str) -> dict[str, Any]:
+def _comparison(evaluations: Sequence[Evaluation], comparison: Comparison | None, different: str) -> dict[str, Any]:
     """The comparison on the page; paired differences only for controllers that flew the same trials."""
-    judgements = [dataclasses.replace(one.judgement, name=name) for name, one in zip(names, evaluations, strict=True)]
-    numbered = [(f"{number} {judgement.name}", judgement) for number, judgement in enumerate(judgements, start=1)]
+    judgements = [evaluation.judgement for evaluation in evaluations]
     shown = {
         "table": comparison_table(judgements),
-        "share": plots.settled_share(numbered),
-        "tasks": words.task_differences([(name, one.task) for name, one in zip(names, evaluations, strict=True)]),
+        "share": plots.settled_share(judgements),
+        "tasks": words.task_differences(evaluations),
     }
-    if isinstance(compared, str):
+    if comparison is None:
         unknown = ("conditions", "sentences", "reference", "responses", "boxes", "differences")
-        return {**shown, "paired": compared, **dict.fromkeys(unknown)}
-    reference, differences = compared.reference, compared.differences
-    found = [sentences([one for one in differences if one.name == name], names[reference]) for name in names]
+        return {**shown, "paired": different, **dict.fromkeys(unknown)}
     return {
         **shown,
-        "conditions": conditions(judgements),
-        "sentences": [told for told in found if told],
-        "reference": controller_cell(reference + 1, names[reference]),
-        "paired": comparison_plots.paired(compared),
-        "responses": comparison_plots.responses([one.flights for one in evaluations], compared),
-        "boxes": comparison_plots.boxes(compared),
-        "differences": differences_table(judgements, reference, differences),
+        "conditions": conditions(comparison),
+        "sentences": sentences(comparison),
+        "reference": controller_cell(comparison.reference + 1, comparison.names[comparison.reference]),
+        "paired": comparison_plots.paired(comparison),
+        "responses": comparison_plots.responses([one.flights for one in evaluations], comparison),
+        "boxes": comparison_plots.boxes(comparison),
+        "differences": differences_table(comparison),
     }

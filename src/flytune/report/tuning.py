@@ -1,29 +1,24 @@
-"""The page of a tuning: what was required and reached, the response of the result, and the reason of each edit."""
+"""The page of a tuning: the requirement and the response that was reached, and the reason of each edit."""
 
-import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import plotly.graph_objects as go
-from plotly.subplots import make_subplots
 
 from flytune.evaluation.evaluate import Evaluation, evaluate
 from flytune.evaluation.judge import Judgement
-from flytune.evaluation.statistics import quantile
+from flytune.evaluation.statistics import median, quantile
+from flytune.evaluation.table import error_unit
 from flytune.report import plots, style
 from flytune.report.page import write_page
 from flytune.tables import NULL, Cell, Column, Table, number
 
 
 def write_tuning(path: Path, tuning: Mapping[str, Any], evaluation: Evaluation | None = None) -> None:
-    """Write the page of a tuning, whole or not at all.
+    """Write the page of a tuning (`Tuning.to_dict`), whole or not at all.
 
-    Args:
-        path: the file.
-        tuning: the plain values of a tuning, `Tuning.to_dict`.
-        evaluation: the best policy on its last validation set; it is flown again where None.
+    `evaluation` is that of the best policy on its last validation set; the policy flies again where None.
 
     Raises:
         BadInput: the file cannot be written, or the best policy cannot be read.
@@ -61,12 +56,11 @@ def requirement_table(tuning: Mapping[str, Any], judgement: Judgement) -> Table:
     """What was required, what the best policy reached on the validation set, and whether that is met."""
     required, misses = tuning["requirement"], _last_validation(tuning)["misses"]
     axis, percentile = required["axis"], required["percentile"]
-    scale, unit = _error_unit(axis)
+    unit, scale, decimals = error_unit(axis)
     times, level = judgement.settling_time[axis], "median" if percentile == 50 else f"percentile {percentile:g}"
     time = "at most {0:g} s" if required["at_most"] else "{0:g} s ± {1:g} %"
-    overshoot = quantile(judgement.overshoot[axis], 0.5)
-    error = quantile(judgement.steady_state_error[axis], 0.5)
-    settled = np.count_nonzero(np.isfinite(times))
+    overshoot, error = median(judgement.overshoot[axis]), median(judgement.steady_state_error[axis])
+    settled, share = judgement.settled(axis), f"at least {100 * required['settled']:g} %"
     rows = {
         "settling_time": (
             f"settling time, {level}",
@@ -81,27 +75,20 @@ def requirement_table(tuning: Mapping[str, Any], judgement: Judgement) -> Table:
         "error": (
             "steady-state error, median",
             f"at most {scale * required['error']:.3g} {unit}",
-            _with_unit(error, 2 if axis == "yaw" else 1, scale, unit),
+            _with_unit(error, decimals, scale, unit),
         ),
         "settled": (
             "trials that settle",
-            f"at least {100 * required['settled']:g} %",
+            share,
             f"{100 * settled / judgement.trials:g} % ({settled} of {judgement.trials})",
         ),
     }
     if "constraints_satisfied" in misses:
-        share = 100 * (required["settled"] + misses["constraints_satisfied"])
-        rows["constraints_satisfied"] = (
-            "trials that satisfy your constraints",
-            f"at least {100 * required['settled']:g} %",
-            f"{share:.3g} %",
-        )
+        satisfied = 100 * (required["settled"] + misses["constraints_satisfied"])
+        rows["constraints_satisfied"] = ("trials that satisfy your constraints", share, f"{satisfied:.3g} %")
     met, missed = Cell(text="met", tone="verdict good"), Cell(text="not met", tone="verdict bad")
-    return Table.plain(
-        (axis, "required", "reached", ""),
-        [(*row, missed if name in misses else met) for name, row in rows.items()],
-        style="narrow",
-    )
+    cells = [(*row, missed if name in misses else met) for name, row in rows.items()]
+    return Table.plain((axis, "required", "reached", ""), cells, style="narrow")
 
 
 def edit_table(tuning: Mapping[str, Any]) -> Table:
@@ -122,7 +109,7 @@ def edit_table(tuning: Mapping[str, Any]) -> Table:
 def validation_table(tuning: Mapping[str, Any]) -> Table:
     """Every iteration that was judged on a validation set, and what misses the requirement there."""
     axis = tuning["requirement"]["axis"]
-    scale, unit = _error_unit(axis)
+    unit, scale, _ = error_unit(axis)
 
     def response(validation: Mapping[str, Any]) -> Mapping[str, Any]:
         judged = validation["judgement"]
@@ -144,7 +131,7 @@ def response_per_iteration(tuning: Mapping[str, Any]) -> go.Figure:
     """Settling time, overshoot and error over the iterations, each with the range that is required."""
     required, lines = tuning["requirement"], tuning["iterations"]
     numbers = [line["number"] for line in lines]
-    scale, unit = _error_unit(required["axis"])
+    unit, scale, _ = error_unit(required["axis"])
     wanted = required["settling_time"]
     spread = required["tolerance"] * wanted
     lowest, highest = (0.0, wanted) if required["at_most"] else (wanted - spread, wanted + spread)
@@ -153,45 +140,31 @@ def response_per_iteration(tuning: Mapping[str, Any]) -> go.Figure:
         ("overshoot [%]", "overshoot", 100.0, 0.0, 100 * required["overshoot"]),
         (f"steady-state error [{unit}]", "error", scale, 0.0, scale * required["error"]),
     )
-    figure = make_subplots(1, 3, subplot_titles=[style.heading(title) for title, *_ in panels], horizontal_spacing=0.08)
+    figure = style.panels(1, 3, [title for title, *_ in panels], horizontal_spacing=0.08)
     fills = [style.TRIALS[0] if each == tuning["best"] else "white" for each in numbers]
     marker = {"size": 9, "color": fills, "line": {"color": style.TRIALS[0], "width": 1.6}}
+    points: dict[str, Any] = {"mode": "markers", "marker": marker, "hovertemplate": "%{y:.3g}"}
+    edges: dict[str, Any] = {"mode": "lines", "line": {"color": style.TRIALS[0], "width": 1.2}, "hoverinfo": "skip"}
     steps = [(line["parent"], line["number"]) for line in lines if line["parent"] is not None]
+    ends = [end for step in steps for end in (*step, None)]
     for column, (_, name, factor, low, high) in enumerate(panels, start=1):
         values = [None if line["response"][name] is None else factor * line["response"][name] for line in lines]
         at = dict(zip(numbers, values, strict=True))
-        place: dict[str, Any] = {"row": 1, "col": column}
-        figure.add_trace(
-            go.Scatter(
-                x=[end for step in steps for end in (*step, None)],
-                y=[end for first, second in steps for end in (at[first], at[second], None)],
-                mode="lines",
-                line={"color": style.TRIALS[0], "width": 1.2},
-                showlegend=False,
-                hoverinfo="skip",
-            ),
-            **place,
-        )
-        figure.add_trace(
-            go.Scatter(x=numbers, y=values, mode="markers", marker=marker, showlegend=False, hovertemplate="%{y:.3g}"),
-            **place,
-        )
+        place = style.at(1, column)
+        heights = [None if end is None else at[end] for end in ends]
+        figure.add_trace(go.Scatter(x=ends, y=heights, showlegend=False, **edges), **place)
+        figure.add_trace(go.Scatter(x=numbers, y=values, showlegend=False, **points), **place)
         # after the traces: plotly leaves an empty panel without it
         figure.add_hrect(y0=low, y1=high, fillcolor=style.BAND, line_width=0, **place)
         top = max([value for value in values if value is not None] + [high]) or 1.0
         figure.update_yaxes(range=[0, 1.1 * top], **place)
     figure.update_xaxes(title_text="iteration", dtick=1 if len(numbers) < 15 else None)
-    return style.frame(figure, 360, margin={"l": 50, "r": 14, "t": 64, "b": 48})
+    return style.frame(figure, 360, margin={"l": 50})
 
 
 def _last_validation(tuning: Mapping[str, Any]) -> Mapping[str, Any]:
     """The last validation of the best iteration."""
     return next(each for each in reversed(tuning["validations"]) if each["iteration"] == tuning["best"])
-
-
-def _error_unit(axis: str) -> tuple[float, str]:
-    """Factor and name of the unit that steady-state errors are shown in."""
-    return (math.degrees(1), "deg") if axis == "yaw" else (1e3, "mm")
 
 
 def _with_unit(value: float | None, decimals: int, scale: float, unit: str) -> str:

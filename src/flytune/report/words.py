@@ -1,4 +1,4 @@
-"""What a page says of flights and tasks beside its tables and figures, as plain values that the templates write."""
+"""The texts of a page on flights and tasks, as plain values that the templates write."""
 
 import re
 from collections.abc import Sequence
@@ -7,7 +7,9 @@ from typing import Any
 import numpy as np
 
 from flytune.config import document, nested
+from flytune.evaluation.evaluate import Evaluation
 from flytune.evaluation.judge import AXES, Judgement
+from flytune.evaluation.statistics import median
 from flytune.report.style import listed
 from flytune.tables import NULL, Column, Table, number
 from flytune.task.task import Task, write_task
@@ -18,20 +20,19 @@ COMMENT = re.compile(r"""^((?:"(?:\\.|[^"\\])*"|'[^']*'|[^"'#])*)(#.*)$""")  # a
 def summary(judgement: Judgement) -> dict[str, Any]:
     """The parts of one sentence: trials that settle on all axes, and the slowest axis or the axes that fail."""
     settled = np.logical_and.reduce([np.isfinite(judgement.settling_time[axis]) for axis in AXES])
-    judged = judgement.to_dict()["axes"]
-    medians = {axis: judged[axis]["settling_time"]["median"] for axis in AXES}
-    late = [axis for axis in AXES if medians[axis] is None]
-    slowest = max((axis for axis in AXES if axis not in late), key=lambda axis: medians[axis], default="")
+    medians = {axis: median(judgement.settling_time[axis]) for axis in AXES}
+    known = {axis: time for axis, time in medians.items() if time is not None}
+    slowest = max(known, key=known.__getitem__, default="")
     return {
         "settled": np.count_nonzero(settled),
-        "late": listed(late),
+        "late": listed([axis for axis in AXES if axis not in known]),
         "slowest": slowest,
-        "median": number(medians.get(slowest), 2),
+        "median": number(known.get(slowest), 2),
     }
 
 
 def facts(judgement: Judgement, speed_bound: float | None) -> dict[str, str]:
-    """What does not belong to one axis, as terms and their meaning: failures, bounds, speed, action."""
+    """The results that belong to no single axis, as terms and their values: failures, bounds, speed, action."""
     judged = judgement.to_dict()
     crossed = [f"{name} {count}" for name, count in judged["violations"].items()]
     peak, action = judged["peak_speed"], judged["action"]
@@ -50,14 +51,14 @@ def facts(judgement: Judgement, speed_bound: float | None) -> dict[str, str]:
     }
 
 
-def task_differences(tasks: Sequence[tuple[str, Task]]) -> Table | None:
+def task_differences(evaluations: Sequence[Evaluation]) -> Table | None:
     """The fields in which the tasks of several controllers differ, one column per controller; None where none does."""
-    plain = [document.plain(task) for _, task in tasks]
+    plain = [document.plain(evaluation.task) for evaluation in evaluations]
     flat = [{path: str(value) for path, value in nested.leaves(task, skip=["sources"])} for task in plain]
     paths = dict.fromkeys(path for leaves in flat for path in leaves)
     differing = [path for path in paths if len({leaves.get(path) for leaves in flat}) > 1]
     rows = [(path, *(leaves.get(path, NULL) for leaves in flat)) for path in differing]
-    return Table.plain(["field", *(Column(name) for name, _ in tasks)], rows) if rows else None
+    return Table.plain(["field", *(Column(one.name) for one in evaluations)], rows) if rows else None
 
 
 def task_lines(task: Task) -> list[tuple[str, str]]:

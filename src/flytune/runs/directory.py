@@ -25,9 +25,9 @@ from flytune.task.task import Task, load_task, write_task
 CHECKPOINT = Path("checkpoint") / "train_state.safetensors"  # in a run directory
 
 
-def new_directory(task: Task, trainer: str, seed: int, parent: Path = Path("runs")) -> Path:
+def new_directory(task: Task, trainer: str, seed: int) -> Path:
     """A directory that does not exist yet, named after the training, with a number where the name is taken."""
-    base = parent / f"{task.name}-{trainer}-s{seed}"
+    base = Path("runs") / f"{task.name}-{trainer}-s{seed}"
     path, number = base, 2
     while path.exists():
         path, number = base.with_name(f"{base.name}-{number}"), number + 1
@@ -79,14 +79,13 @@ class RunDirectory:
             raise BadInput(
                 f"resume: {self.path} was trained with another {path}. Give {self.path}/task.toml as the task."
             )
-        if has_checkpoint(self.path):
-            return
-        if (self.path / "checkpoint" / "learner.safetensors").exists():
+        if (self.path / "checkpoint" / "learner.safetensors").exists() and not has_checkpoint(self.path):
             raise BadInput(
                 f"resume: {self.path} holds the checkpoint of an older version of flytune (learner.safetensors), which "
                 "this version cannot continue. Train again into another directory."
             )
-        raise BadInput(f"resume: {self.path} holds no checkpoint. Train again into another directory.")
+        if not has_checkpoint(self.path):
+            raise BadInput(f"resume: {self.path} holds no checkpoint. Train again into another directory.")
 
     def checkpoint(self, train_state: Any, rows: list[dict[str, Any]]) -> None:
         """Write everything that is needed to continue exactly, and the metrics so far."""

@@ -24,13 +24,13 @@ KINDS = f"a run directory, a policy file ({', '.join(READERS)}), {', '.join(CLAS
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class FoundController:
-    """A controller, the task it flies, and how it was made. It is a controller too, and flies in the same way."""
+    """A controller, the task it flies, and how it was made; it is used like the controller itself."""
 
     name: str
     controller: Controller
     task: Task  # the one asked for, else the one it was trained for, else the baseline
-    metrics: list[dict[str, Any]] | None  # of its training, one row per update; None where it has none
-    about: dict[str, str]  # facts for a reader
+    metrics: list[dict[str, Any]] | None = None  # of its training, one row per update; None where it has none
+    about: dict[str, str] = dataclasses.field(default_factory=dict)  # facts for a reader
 
     def initial_memory(self) -> Any:
         """The memory of the controller before its first observation."""
@@ -55,10 +55,9 @@ jax.tree_util.register_pytree_node(FoundController, lambda found: ((found.contro
 def find_controller(name: str, task: str | Task | None = None) -> FoundController:
     """The controller that a run directory, a policy file or the name of a classical controller stands for.
 
-    Args:
-        name: `runs/baseline-apg-s0`, `policy.safetensors`, `policy.onnx`, a Stable-Baselines3 model `model.zip`,
-            `pid`, `geometric` or `lqr` (gains tuned by search; `pid@textbook` for those of the books).
-        task: the task to fly, a preset, a TOML file or a task; where None, that of its training, or the baseline.
+    A policy file is one of flytune, ONNX or a Stable-Baselines3 model `model.zip`; classical controllers are `pid`,
+    `geometric` and `lqr` (gains tuned by search; `pid@textbook` for those of the books). `task` is the task to fly, a
+    preset, a TOML file or a task; where None, that of the controller's training, or the baseline.
 
     Raises:
         BadInput: no controller has this name, or it cannot be used.
@@ -71,10 +70,10 @@ def find_controller(name: str, task: str | Task | None = None) -> FoundControlle
         return _from_file(name, path, wanted)
     kind, at, gains = name.partition("@")
     if kind in CLASSICAL:
-        flown = wanted or load_task("baseline")
-        controller = classical_controller(kind, flown, gains if at else "tuned")
+        wanted = wanted or load_task("baseline")
+        controller = classical_controller(kind, wanted, gains if at else "tuned")
         about = {"controller": kind, "gains": gains or "tuned"}
-        return FoundController(name=name, controller=controller, task=flown, metrics=None, about=about)
+        return FoundController(name=name, controller=controller, task=wanted, about=about)
     if name in shipped_names():
         return _shipped(name, wanted)
     raise BadInput(f"{name}: no such controller. Allowed: {KINDS}{''.join(f', {name}' for name in shipped_names())}.")
@@ -85,16 +84,14 @@ def _from_file(name: str, path: Path, wanted: Task | None) -> FoundController:
     about = {key: str(value) for key, value in policy.about.items() if key != "task_toml"}
     text = policy.about.get("task_toml")
     task = wanted or (read_task_text(text, name) if text else load_task("baseline"))
-    return FoundController(name=name, controller=policy, task=task, metrics=None, about=about)
+    return FoundController(name=name, controller=policy, task=task, about=about)
 
 
 def _shipped(name: str, wanted: Task | None) -> FoundController:
     path, record = shipped_files(name)
     facts = json.loads(record.read_text(encoding="utf-8"))
-    controller = _from_file(name, path, wanted)
-    return dataclasses.replace(
-        controller, about=controller.about | {"trained": facts["time"], "commit": str(facts["commit"])}
-    )
+    found = _from_file(name, path, wanted)
+    return dataclasses.replace(found, about=found.about | {"trained": facts["time"], "commit": str(facts["commit"])})
 
 
 def _from_run(name: str, path: Path, wanted: Task | None) -> FoundController:
