@@ -42,7 +42,7 @@ def train(task: Task, /, *, options: TrainOptions = TrainOptions()) -> None:
         wanted = find_trainer(options.trainer).with_steps(wanted, options.steps)
     if options.resume and options.out is None:
         raise BadInput("resume: needs --out DIR, the run to continue.")
-    out = options.out or new_directory(wanted, options.trainer, options.seed)
+    out = options.out or new_directory(f"{wanted.name}-{options.trainer}-s{options.seed}")
     with show_progress() as on_progress:
         run = train(wanted, options.trainer, seed=options.seed, out=out, resume=options.resume,
                     tensorboard=options.tensorboard, on_progress=on_progress)  # fmt: skip
