@@ -152,7 +152,8 @@ def measure(folder: Path, updates: int, seeds: int, workers: int) -> None:
 
 def document_it() -> None:
     """Write the tables and the drawing of the documentation from the measured data."""
-    from flytune.tuning.heuristics import draw_sensitivities, heuristics_tables
+    from heuristics import draw_sensitivities, heuristics_tables
+
     from flytune.tuning.sensitivity import load_sensitivities
 
     sensitivities = load_sensitivities()

@@ -119,8 +119,8 @@ def solve(folder: Path, index: int, method: str, seed: int) -> None:
     row: dict[str, Any] = {"requirement": name_of(index), "method": method, "seed": seed}
     try:
         tuner = CachedTuner(
-            requirement, load_rules(), work, task=None, edits=fixed, seed=seed, trainer="apg", most_iterations=BUDGET,
-            on_message=said.append, on_progress=None,
+            requirement=requirement, rules=load_rules(), out=work, task=None, edits=fixed, seed=seed, trainer="apg",
+            most_iterations=BUDGET, on_message=said.append, on_progress=None,
         )  # fmt: skip
     except BadInput as refusal:
         row |= {"refused": str(refusal), "seconds": round(time.monotonic() - began, 1)}
@@ -139,6 +139,7 @@ def search(tuner: Any, method: str, seed: int) -> bool:
     """Whether Optuna meets the requirement within the budget, from the policy the tuner starts with."""
     import optuna
 
+    from flytune.tuning.iteration import Iteration
     from flytune.tuning.rules import number_at
 
     optuna.logging.set_verbosity(optuna.logging.WARNING)
@@ -180,7 +181,10 @@ def search(tuner: Any, method: str, seed: int) -> bool:
             return not history.validated(nearest.number) and not tuner.validate(nearest).misses
         trial = study.ask()
         values = {name: trial.suggest_float(name, low, high, log=True) for name, (low, high) in ranges.items()}
-        tuner.train(len(history.iterations), values, dict.fromkeys(values, method), None, 0)
+        planned = Iteration(
+            number=len(history.iterations), values=values, reasons=dict.fromkeys(values, method), parent=0
+        )
+        tuner.train(planned)
         study.tell(trial, distance(history.iterations[-1]))
 
 

@@ -13,6 +13,7 @@ from flytune.tuning.iteration import HALF_WAY, Iteration
 from flytune.tuning.requirement import ResponseSummary, make_requirement
 from flytune.tuning.rules import load_rules
 from flytune.tuning.sensitivity import load_sensitivities
+from flytune.tuning.slopes import Context
 
 TABLES = document.plain(load_task("baseline-refined"))
 SPEED = "termination.speed.bound"
@@ -35,8 +36,12 @@ def iteration(number=0, values=None, edit=None, parent=None, **response):
     )
 
 
+def choice(*known, trainer="apg"):
+    return choose(Context(*known, trainer))
+
+
 def chosen(iterations, wanted, fixed=(), sensitivities=UNKNOWN, rules=RULES):
-    found = choose(iterations, TABLES, wanted, rules, sensitivities, fixed)
+    found = choice(iterations, TABLES, wanted, rules, sensitivities, fixed)
     assert not isinstance(found, list), found
     return found
 
@@ -116,7 +121,7 @@ def test_what_the_user_has_fixed_is_not_touched():
 
 
 def test_where_every_field_is_fixed_each_rule_names_it():
-    found = choose(
+    found = choice(
         [iteration(settling_time=4.0)], TABLES, make_requirement(2), RULES, UNKNOWN, ("termination", "reward")
     )
     assert isinstance(found, list)
@@ -159,7 +164,7 @@ def test_a_rule_is_not_used_while_a_measure_it_requires_is_missed():
     # with too much overshoot, H6 must not lower the velocity weight to be faster
     iterations = [iteration(settling_time=4.0, overshoot=0.2)]
     only = [rule for rule in RULES if rule.name == "H6 faster"]
-    found = choose(iterations, TABLES, make_requirement(2), only, UNKNOWN, ())
+    found = choice(iterations, TABLES, make_requirement(2), only, UNKNOWN, ())
     assert found == ["too slow: H6 faster (not while the overshoot is missed)"]
 
 
@@ -167,7 +172,7 @@ def test_a_rule_that_was_measured_to_do_the_opposite_is_not_used():
     curve = KNOWN.parameters[SPEED]
     upside_down = dataclasses.replace(KNOWN, parameters={"reward.velocity.weight": curve})  # up is faster there
     rules = [rule for rule in RULES if rule.name == "H6 faster"]
-    found = choose([iteration(settling_time=4.0)], TABLES, make_requirement(2), rules, upside_down, ())
+    found = choice([iteration(settling_time=4.0)], TABLES, make_requirement(2), rules, upside_down, ())
     assert found == ["too slow: H6 faster (its measured effect there is opposite)"]
 
 
@@ -184,7 +189,7 @@ def test_no_edit_is_made_twice():
     only = [rule for rule in RULES if rule.field == SPEED]
     iterations = after([iteration(settling_time=2.5)], wanted, settling_time=1.7)
     for _ in range(20):
-        found = choose(iterations, TABLES, wanted, only, UNKNOWN, ())
+        found = choice(iterations, TABLES, wanted, only, UNKNOWN, ())
         if isinstance(found, list):
             break
         parent, edit = found
@@ -210,17 +215,17 @@ def test_a_setting_of_another_trainer_is_left_alone():
     lame = [iteration(settled=0.9)]
     longer = [rule for rule in RULES if rule.field in ("apg.updates", "ppo.steps")]
     for trainer, field in (("apg", "apg.updates"), ("ppo", "ppo.steps")):
-        found = choose(lame, TABLES, make_requirement(2), longer, KNOWN, (), trainer=trainer)
+        found = choice(lame, TABLES, make_requirement(2), longer, KNOWN, (), trainer=trainer)
         assert not isinstance(found, list)
         assert found[1].field == field
 
 
 def test_a_parameter_without_a_measured_effect_is_edited_with_another_trainer_only():
     only = [rule for rule in RULES if rule.name == "H1 bolder"]
-    found = choose([iteration(settling_time=4.0)], TABLES, make_requirement(2), only, KNOWN, ())
+    found = choice([iteration(settling_time=4.0)], TABLES, make_requirement(2), only, KNOWN, ())
     assert found == ["too slow: H1 bolder (it has no measured effect)"]
     bolder = [dataclasses.replace(rule, slope=-0.5) for rule in only]
-    found = choose([iteration(settling_time=4.0)], TABLES, make_requirement(2), bolder, KNOWN, (), trainer="ppo")
+    found = choice([iteration(settling_time=4.0)], TABLES, make_requirement(2), bolder, KNOWN, (), trainer="ppo")
     assert not isinstance(found, list)
     assert found[1].known_from == "rule"
 
@@ -239,7 +244,7 @@ def test_an_edit_that_makes_another_measure_miss_is_refused():
     iterations = [iteration(settling_time=2.86)]
     _, edit = chosen(iterations, make_requirement(6), sensitivities=KNOWN, rules=only)
     assert edit.after < 400
-    refused = choose(iterations, TABLES, make_requirement(6, overshoot=0), only, KNOWN, ())
+    refused = choice(iterations, TABLES, make_requirement(6, overshoot=0), only, KNOWN, ())
     assert refused == ["too fast: H9 slower turns (it would make the overshoot worse)"]
 
 
@@ -248,12 +253,12 @@ def test_the_nearest_iteration_predicts_the_other_measures_of_an_edit():
     wanted = make_requirement(2, tolerance=2)
     rules = [rule for rule in RULES if rule.field in (SPEED, "apg.updates")]
     iterations = after([iteration(settling_time=2.2)], wanted, settling_time=1.985)
-    parent, edit = choose(iterations, TABLES, make_requirement(2.05, tolerance=2), rules, UNKNOWN, ())
+    parent, edit = choice(iterations, TABLES, make_requirement(2.05, tolerance=2), rules, UNKNOWN, ())
     assert (edit.field, edit.known_from) == (SPEED, "interpolation")
     iterations[1] = dataclasses.replace(
         iterations[1], response=dataclasses.replace(iterations[1].response, settled=0.985)
     )
-    parent, edit = choose(iterations, TABLES, wanted, rules, UNKNOWN, ())
+    parent, edit = choice(iterations, TABLES, wanted, rules, UNKNOWN, ())
     assert (parent.number, edit.field) == (1, "apg.updates")
 
 
@@ -263,9 +268,9 @@ def test_an_edit_that_the_task_cannot_have_beside_its_other_fields_is_left_out()
     lower = dataclasses.replace(
         RULES[0], field="reward.horizontal.narrow", direction="down", slope=0.8, range=(1.0, 100.0)
     )
-    found = choose([iteration(settling_time=4.0)], tables, make_requirement(2), [lower], UNKNOWN, ())
+    found = choice([iteration(settling_time=4.0)], tables, make_requirement(2), [lower], UNKNOWN, ())
     assert found == ["H7 faster (reward.horizontal.narrow 8.41 is not allowed in this task)"]
-    _, edit = choose([iteration(settling_time=4.0)], tables, make_requirement(2), [lower, RULES[0]], UNKNOWN, ())
+    _, edit = choice([iteration(settling_time=4.0)], tables, make_requirement(2), [lower, RULES[0]], UNKNOWN, ())
     assert (edit.field, edit.next_best) == (SPEED, None)
 
 

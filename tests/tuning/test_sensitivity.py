@@ -12,7 +12,10 @@ from flytune.tuning.sensitivity import Curve, Point, SeedResult, Sensitivities, 
 
 
 def result(seed, time):
-    return SeedResult(seed=seed, settled=100, settling_time=time, overshoot=0.0, error=0.01, details={})
+    return SeedResult(
+        seed=seed, settled=100, settling_time=time, overshoot=0.0, error=0.01, settling_time_axes={},
+        overshoot_axes={}, yaw_error=0.01, violations={}, crashed=0,
+    )  # fmt: skip
 
 
 def sensitivities(values, times, spread=0.0):

@@ -40,7 +40,7 @@ def train(
         wanted = find_trainer(trainer).with_steps(wanted, steps)
     if resume and out is None:
         raise BadInput("resume: needs --out DIR, the run to continue.")
-    out = out or new_directory(wanted, trainer, seed)
+    out = out or new_directory(f"{wanted.name}-{trainer}-s{seed}")
     with show_progress() as on_progress:
         run = train(
             wanted, trainer, seed=seed, out=out, resume=resume, tensorboard=tensorboard, on_progress=on_progress

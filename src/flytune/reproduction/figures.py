@@ -1,9 +1,11 @@
-"""The figures of a reproduction (paper R21), each drawn once, as SVG: for the folder, for the page and for the docs."""
+"""The figures of a reproduction (paper R21) as SVG: for the folder, for the page and for the documentation."""
 
 import dataclasses
 import functools
 import io
+import tomllib
 from collections.abc import Callable, Sequence
+from importlib import resources
 from typing import Any
 
 import matplotlib as mpl
@@ -44,7 +46,10 @@ class FigureSpec:
     section: str
     title: str
     caption: str
-    draw: Callable[[Evidence], Figure]
+
+
+_FIGURES_FILE = resources.files("flytune.reproduction") / "figures.toml"
+FIGURES = [FigureSpec(**table) for table in tomllib.loads(_FIGURES_FILE.read_text(encoding="utf-8"))["figure"]]
 
 
 def draw_figures(evidence: Evidence) -> dict[str, str]:
@@ -53,7 +58,7 @@ def draw_figures(evidence: Evidence) -> dict[str, str]:
     with mpl.rc_context(STYLE):
         for figure in FIGURES:
             text = io.StringIO()
-            figure.draw(evidence).savefig(text, format="svg", metadata={"Date": None}, bbox_inches="tight")
+            DRAWINGS[figure.name](evidence).savefig(text, format="svg", metadata={"Date": None}, bbox_inches="tight")
             drawn[figure.name] = text.getvalue()
     return drawn
 
@@ -189,82 +194,19 @@ def _error(judged: Judgement, axis: str) -> np.ndarray:
     return np.maximum(np.degrees(error) if axis == "yaw" else 1e3 * error, 0.01)
 
 
-def _metrics(suffix: str, section: str, setting: str) -> list[FigureSpec]:
-    """The three figures of metrics under one setting."""
-    settling = functools.partial(_boxes, metric=_settling_time, label="settling time [s]", setting=setting)
-    overshoot = functools.partial(_boxes, metric=_overshoot, label="overshoot [% of the step]", setting=setting)
-    error = functools.partial(
-        _boxes, metric=_error, label="steady-state error [mm; deg]", setting=setting, logarithmic=True
-    )
-    return [
-        FigureSpec(
-            name=f"settling{suffix}",
-            section=section,
-            title="Settling time",
-            caption="Only trials that settle are in a box; the percentage above it says how many these are. A low box "
-            "of few trials is no success.",
-            draw=settling,
-        ),
-        FigureSpec(
-            name=f"overshoot{suffix}",
-            section=section,
-            title="Overshoot",
-            caption="Raw overshoot: excursions that stay inside the settling band count. Trials with a small step have "
-            "no overshoot.",
-            draw=overshoot,
-        ),
-        FigureSpec(
-            name=f"error{suffix}",
-            section=section,
-            title="Steady-state error",
-            caption="Distance of the mean of the last two seconds from the target, on each axis. The scale is "
-            "logarithmic.",
-            draw=error,
-        ),
-    ]
-
-
-FIGURES = [
-    FigureSpec(
-        name="reward",
-        section="Learning",
-        title="Episode reward",
-        caption="The line is the mean over seeds, the band reaches from the worst seed to the best. The rewards of "
-        "different behaviours are not on one scale: the terms of inspection add up to less.",
-        draw=_reward,
-    ),
-    *_metrics("", "Metrics as printed", "printed"),
-    *_metrics("-fair", "Metrics under the fair setting", "fair"),
-    FigureSpec(
-        name="profile",
-        section="Performance profile and motors",
-        title="Performance profile",
-        caption="The first five trials of the first seed, from the same starts and with the same noise for each "
-        "behaviour. The green band is the settling band.",
-        draw=_profile,
-    ),
-    FigureSpec(
-        name="rotor-speed",
-        section="Performance profile and motors",
-        title="Mean rotor speed",
-        caption="What the paper draws. The mean of every controller that hovers is the hover speed (C6).",
-        draw=_rotor_speed,
-    ),
-    FigureSpec(
-        name="actuation",
-        section="Performance profile and motors",
-        title="Action",
-        caption="RMS and total variation of the action over all seeds and trials. These tell controllers apart (C6).",
-        draw=_actuation,
-    ),
-    FigureSpec(
-        name="settling-averaged",
-        section="Averaged weights",
-        title="Settling time with averaged weights",
-        caption="The same as the settling time under the fair setting, with the weights averaged over updates. "
-        "Verdicts rest on the weights of the last update.",
-        draw=functools.partial(
-            _boxes, metric=_settling_time, label="settling time [s]", weights="averaged", setting="fair"
-        ),
-    ),
-]
+_settling = functools.partial(_boxes, metric=_settling_time, label="settling time [s]")
+_overshoots = functools.partial(_boxes, metric=_overshoot, label="overshoot [% of the step]")
+_errors = functools.partial(_boxes, metric=_error, label="steady-state error [mm; deg]", logarithmic=True)
+DRAWINGS: dict[str, Callable[[Evidence], Figure]] = {
+    "reward": _reward,
+    "settling": functools.partial(_settling, setting="printed"),
+    "overshoot": functools.partial(_overshoots, setting="printed"),
+    "error": functools.partial(_errors, setting="printed"),
+    "settling-fair": functools.partial(_settling, setting="fair"),
+    "overshoot-fair": functools.partial(_overshoots, setting="fair"),
+    "error-fair": functools.partial(_errors, setting="fair"),
+    "profile": _profile,
+    "rotor-speed": _rotor_speed,
+    "actuation": _actuation,
+    "settling-averaged": functools.partial(_settling, weights="averaged", setting="fair"),
+}

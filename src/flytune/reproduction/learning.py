@@ -112,5 +112,5 @@ def efficiency(evidence: Evidence, weights: Weights) -> ClaimMeasures:
 def _median_of_seeds(what: str, values: Sequence[float], unit: str, agrees: bool | None = None) -> Measure:
     """The median over seeds between the least and the greatest of them."""
     value = float(np.median(values)) if values else None
-    return Measure(what=what, value=value, low=min(values, default=None), high=max(values, default=None), unit=unit,
-                   agrees=agrees)  # fmt: skip
+    low, high = min(values, default=None), max(values, default=None)
+    return Measure(what=what, value=value, low=low, high=high, unit=unit, agrees=agrees)

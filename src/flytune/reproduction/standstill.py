@@ -1,4 +1,4 @@
-"""C1: from how far a discounted reward is earned best by standing still. NumPy only.
+"""C1: the distance from which standing still earns the largest discounted reward. NumPy only.
 
 The horizontal distance r is all that is left of the vehicle: it moves towards the target at a speed up to its bound, at
 perfect altitude and attitude. Then V(0) = R(0, 0) / (1 - discount), and for growing distance
@@ -49,7 +49,7 @@ def standstill_distance(task: Task, discount: float) -> float | None:
 
 
 def _term(task: Task, of: str, value: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
-    """What the reward's exponentials of one quantity pay; what does not depend on it cancels out of the choice."""
+    """The reward of the exponentials of one quantity; all other terms are equal for every choice of speed."""
     total = np.zeros_like(value)
     for term in task.reward.values():
         if isinstance(term, Exponential) and term.of == of:

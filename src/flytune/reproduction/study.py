@@ -1,6 +1,7 @@
 """A study: the trainings that a reproduction is made of, and how far each of them is on disk."""
 
 import dataclasses
+import itertools
 import json
 import shutil
 from collections.abc import Callable
@@ -120,7 +121,8 @@ def training_status(study: Study, training: Training, on_message: Callable[[str]
             load_policy(directory / "policy.safetensors")
             load_policy(directory / "policy-last.safetensors")
     except BadInput as error:
-        aside = _free_name(directory)
+        names = (directory.with_name(f"{directory.name}.damaged-{number}") for number in itertools.count(1))
+        aside = next(name for name in names if not name.exists())
         directory.rename(aside)
         on_message(f"{directory.name}: damaged, kept as {aside.name} and trained again ({error})")
         return "new"
@@ -135,10 +137,3 @@ def training_status(study: Study, training: Training, on_message: Callable[[str]
         return "interrupted"
     shutil.rmtree(directory)
     return "new"
-
-
-def _free_name(directory: Path) -> Path:
-    number = 1
-    while (aside := directory.with_name(f"{directory.name}.damaged-{number}")).exists():
-        number += 1
-    return aside

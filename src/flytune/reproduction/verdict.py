@@ -29,7 +29,12 @@ class Measure:
 
     def text(self) -> str:
         """The number with its unit and its interval."""
-        write = _percent if self.unit == "share" else _plain
+
+        def write(value: float | None) -> str:
+            if value is None:
+                return "-"
+            return f"{100 * value:.1f} %" if self.unit == "share" else f"{value:.4g}"
+
         number, low, high = map(write, (self.value, self.low, self.high))
         interval = "" if self.low is None and self.high is None else f" [{low}, {high}]"
         return f"{number}{'' if self.unit in ('share', '1') else ' ' + self.unit}{interval}"
@@ -85,11 +90,3 @@ def decide(printed: Sequence[Measure], reading: Sequence[Measure] = ()) -> Verdi
     if reading and all(measure.agrees for measure in reading):
         return "holds under a reading"
     return "does not hold"
-
-
-def _percent(value: float | None) -> str:
-    return "-" if value is None else f"{100 * value:.1f} %"
-
-
-def _plain(value: float | None) -> str:
-    return "-" if value is None else f"{value:.4g}"

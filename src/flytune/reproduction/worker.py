@@ -30,14 +30,8 @@ def main(order: str) -> int:
             print(json.dumps(dataclasses.asdict(progress)), flush=True)
 
     try:
-        train(
-            load_task(options["task"]),
-            options["trainer"],
-            seed=options["seed"],
-            out=Path(options["out"]),
-            resume=options["resume"],
-            on_progress=write,
-        )
+        task, out = load_task(options.pop("task")), Path(options.pop("out"))
+        train(task, out=out, on_progress=write, **options)
     except FlytuneError as error:
         print(error, file=sys.stderr)
         return error.exit_code

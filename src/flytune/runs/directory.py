@@ -25,12 +25,11 @@ from flytune.task.task import Task, load_task, write_task
 CHECKPOINT = Path("checkpoint") / "train_state.safetensors"  # in a run directory
 
 
-def new_directory(task: Task, trainer: str, seed: int) -> Path:
-    """A directory that does not exist yet, named after the training, with a number where the name is taken."""
-    base = Path("runs") / f"{task.name}-{trainer}-s{seed}"
-    path, number = base, 2
+def new_directory(name: str) -> Path:
+    """A directory under `runs` that does not exist yet: `name`, with a number behind it where that is taken."""
+    path, number = Path("runs") / name, 2
     while path.exists():
-        path, number = base.with_name(f"{base.name}-{number}"), number + 1
+        path, number = path.with_name(f"{name}-{number}"), number + 1
     return path
 
 

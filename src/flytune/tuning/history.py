@@ -27,6 +27,7 @@ class History:
 
     directory: Path
     asked: Mapping[str, Any]  # the arguments of the tuning; a resumed tuning must have the same
+    facts: dict[str, Any]  # further entries of the journal
     iterations: list[Iteration] = dataclasses.field(default_factory=list)
     validations: list[Validation] = dataclasses.field(default_factory=list)
 
@@ -69,14 +70,14 @@ class History:
 
         return min((each for each in self.iterations if not each.diverged), key=order)
 
-    def write(self, facts: Mapping[str, Any]) -> None:
-        """Write the journal, whole or not at all; `facts` are further entries.
+    def write(self) -> None:
+        """Write the journal, whole or not at all.
 
         Raises:
             BadInput: the directory cannot be written.
         """
         journal = {
-            "schema": SCHEMA, **self.asked, **facts, "iterations": [each.to_dict() for each in self.iterations],
+            "schema": SCHEMA, **self.asked, **self.facts, "iterations": [each.to_dict() for each in self.iterations],
             "validations": [dataclasses.asdict(each) for each in self.validations],
         }  # fmt: skip
         make_folder(self.directory)

@@ -5,7 +5,7 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from flytune.tuning.requirement import ResponseSummary
+from flytune.tuning.requirement import NO_RESPONSE, ResponseSummary
 from flytune.tuning.rules import SYMPTOMS
 
 HALF_WAY = "half-way back"  # instead of a rule's name: the last edit was too large
@@ -49,13 +49,13 @@ class Iteration:
     """One policy of a tuning: the edits it was trained with, and its response."""
 
     number: int
-    values: Mapping[str, float]  # field -> value, of all edits so far
-    reasons: Mapping[str, str]  # field -> reason
-    edit: Edit | None  # the last edit; None for the first policy
-    parent: int | None  # number of the iteration that was edited
-    response: ResponseSummary
-    trials: int  # trials of the training set when the response was measured
-    seconds: float  # duration of the training
+    values: Mapping[str, float] = dataclasses.field(default_factory=dict)  # field -> value, of all edits so far
+    reasons: Mapping[str, str] = dataclasses.field(default_factory=dict)  # field -> reason
+    edit: Edit | None = None  # the last edit; None for the first policy
+    parent: int | None = None  # number of the iteration that was edited
+    response: ResponseSummary = NO_RESPONSE
+    trials: int = 0  # trials of the training set when the response was measured
+    seconds: float = 0.0  # duration of the training
     diverged: str = ""  # which number became infinite, and where; such an iteration has no policy
 
     def to_dict(self) -> dict[str, Any]:

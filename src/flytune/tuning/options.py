@@ -8,9 +8,9 @@ from flytune.task.task import Task
 from flytune.training.trainer import other_settings_fields
 from flytune.tuning.iteration import Edit, Iteration, already_tried, variants
 from flytune.tuning.requirement import Requirement
-from flytune.tuning.rules import Rule, apply_rule, is_fixed, number_at, symptoms
+from flytune.tuning.rules import SHARES, Rule, apply_rule, is_fixed, number_at, symptoms
 from flytune.tuning.sensitivity import FLOOR
-from flytune.tuning.slopes import MEASURES, Context, find_slope, interpolated
+from flytune.tuning.slopes import MEASURES, Context, NotUsed, find_slope, interpolated
 
 TRUST = {"interpolation": 1.0, "iterations": 1.0, "sensitivity": 0.9, "rule": 0.6}  # in a slope, by its origin
 EFFORT = 0.1  # cost of an edit per factor of e: of two edits with the same gain, the smaller one is better
@@ -29,30 +29,28 @@ def find_options(context: Context, iteration: Iteration) -> tuple[list[tuple[flo
         for rule in context.rules:
             if rule.advice or rule.when != symptom:
                 continue
-            edit = _propose(context, rule, iteration)
-            distance, refusal = (0.0, edit) if isinstance(edit, str) else _predict(context, iteration, edit)
-            if refusal:
-                refused.setdefault(symptom, []).append(f"{rule.name} ({refusal})")
-            elif isinstance(edit, Edit):
-                found.append((distance, edit))
+            try:
+                edit = _propose(context, rule, iteration)
+                found.append((_predict(context, iteration, edit), edit))
+            except NotUsed as reason:
+                refused.setdefault(symptom, []).append(f"{rule.name} ({reason})")
     return found, refused
 
 
-def _propose(context: Context, rule: Rule, iteration: Iteration) -> Edit | str:
-    """The edit that a rule proposes, or the reason why the rule is not used."""
-    value = iteration.values.get(rule.field) or number_at(context.tables, rule.field)
-    if refusal := _refusal(context, rule, iteration, value):
-        return refusal
-    assert value is not None
+def _propose(context: Context, rule: Rule, iteration: Iteration) -> Edit:
+    """The edit that a rule proposes.
+
+    Raises:
+        NotUsed: the rule proposes none.
+    """
+    value = _editable_value(context, rule, iteration)
     slope = find_slope(context, rule, value, iteration)
-    if isinstance(slope, str):
-        return slope
     if slope.known_from != "iterations" and _has_disappointed(context, rule, value):
-        return "it was tried without success"
+        raise NotUsed("it was tried without success")
     now = getattr(iteration.response, rule.measure)
     up = 1 if rule.direction == "up" else -1
     expected: float | None
-    if rule.measure in ("settled", "constraints_satisfied") or not math.isfinite(now):
+    if rule.measure in SHARES or not math.isfinite(now):
         after, gain, expected = apply_rule(rule, value, float(rule.largest) ** up), 0.5, None
     else:
         # never zero: a miss is outside of what is allowed, and the aim is inside
@@ -63,42 +61,37 @@ def _propose(context: Context, rule: Rule, iteration: Iteration) -> Edit | str:
         gain = min(1.0, predicted / wanted)
         expected = now * math.exp(predicted)
     if value == rule.range[up > 0]:
-        return f"{rule.field} is at {value:g}, the end of its range"
+        raise NotUsed(f"{rule.field} is at {value:g}, the end of its range")
     if (after - value) * up <= 0 or abs(after / value - 1) < SMALLEST:
-        return "the iterations on both sides leave nothing to change"
+        raise NotUsed("the iterations on both sides leave nothing to change")
     if (tried := already_tried(iteration, rule.field, after, context.iterations)) is not None:
-        return f"{rule.field} {after:g} was tried in iteration {tried.number}"
+        raise NotUsed(f"{rule.field} {after:g} was tried in iteration {tried.number}")
     return Edit(
-        rule=rule.name,
-        source=rule.source,
-        reason=rule.reason,
-        symptom=rule.when,
-        field=rule.field,
-        before=value,
-        after=after,
-        unit=document.unit_of(Task, context.tables, rule.field),
-        expected=expected,
-        slope=slope.power,
-        known_from=slope.known_from,
-        between=slope.between,
-        gain=gain,
-    )
+        rule=rule.name, source=rule.source, reason=rule.reason, symptom=rule.when,
+        field=rule.field, before=value, after=after, unit=document.unit_of(Task, context.tables, rule.field),
+        expected=expected, slope=slope.power, known_from=slope.known_from, between=slope.between, gain=gain,
+    )  # fmt: skip
 
 
-def _refusal(context: Context, rule: Rule, iteration: Iteration, value: float | None) -> str:
-    """Why a rule cannot be used on an iteration in which its field has this value; empty where it can."""
+def _editable_value(context: Context, rule: Rule, iteration: Iteration) -> float:
+    """The value of the rule's field in an iteration on which the rule can be used.
+
+    Raises:
+        NotUsed: it cannot be used.
+    """
+    value = iteration.values.get(rule.field) or number_at(context.tables, rule.field)
     misses = context.requirement.misses(iteration.response)
     if rule.field.split(".")[0] in other_settings_fields(context.trainer):
-        return f"{rule.field} belongs to another trainer"
+        raise NotUsed(f"{rule.field} belongs to another trainer")
     if is_fixed(rule.field, context.fixed):
-        return f"{rule.field} is set by the user"
+        raise NotUsed(f"{rule.field} is set by the user")
     if not value or value <= 0:
-        return f"the task has no {rule.field}, or it is 0"
+        raise NotUsed(f"the task has no {rule.field}, or it is 0")
     if missed := [measure for measure in rule.requires if measure in misses and measure != rule.measure]:
-        return f"not while the {' and the '.join(missed).replace('_', ' ')} is missed"
+        raise NotUsed(f"not while the {' and the '.join(missed).replace('_', ' ')} is missed")
     if context.same_trainer and not context.sensitivities.has_effect(rule.field, context.requirement.axis):
-        return "it has no measured effect"
-    return ""
+        raise NotUsed("it has no measured effect")
+    return value
 
 
 def _aim(measure: str, requirement: Requirement) -> float:
@@ -115,34 +108,34 @@ def _has_disappointed(context: Context, rule: Rule, value: float) -> bool:
     effect only beyond a threshold.
     """
     iterations, up = context.iterations, rule.direction == "up"
-    used = [
+    uses = (
         each
-        for each in iterations
+        for each in reversed(iterations)
         if each.edit
         and each.edit.rule == rule.name
-        and each.parent is not None
         and context.sensitivities.same_interval(rule.field, value, up, each.edit.before)
-    ]
-    if not used:
+    )
+    last = next(uses, None)
+    if last is None or last.edit is None or last.parent is None:
         return False
-    last = used[-1]
-    before = getattr(iterations[last.parent or 0].response, rule.measure)
-    now = getattr(last.response, rule.measure)
-    if rule.measure in ("settled", "constraints_satisfied"):
+    before, now = (getattr(each.response, rule.measure) for each in (iterations[last.parent], last))
+    if rule.measure in SHARES:
         return now <= before
-    assert last.edit is not None
     expected = last.edit.expected
     if expected is None or not math.isfinite(before):
         return not math.isfinite(now)
-    return (now - before) / (expected - before) < 0.1 if expected != before else False
+    return expected != before and (now - before) / (expected - before) < 0.1
 
 
-def _predict(context: Context, iteration: Iteration, edit: Edit) -> tuple[float, str]:
-    """The predicted distance from the requirement after an edit; and why the edit is no improvement, where it is none.
+def _predict(context: Context, iteration: Iteration, edit: Edit) -> float:
+    """The predicted distance from the requirement after an edit.
 
     The miss of the edit's own measure shrinks by the gain of the edit times the trust in its slope. The other misses
     become those of the iteration that is nearest to the edit; where there is none, the measured sensitivities decide
     which other measure the edit makes miss its requirement.
+
+    Raises:
+        NotUsed: the edit is no improvement.
     """
     misses = context.requirement.weighted_misses(iteration.response)
     own, before = misses[edit.measure], sum(misses.values())
@@ -157,9 +150,9 @@ def _predict(context: Context, iteration: Iteration, edit: Edit) -> tuple[float,
         harm = {name: HARM * own for name in others if _causes_miss(context, edit, iteration, name)}
     distance = before - own * gain + sum(harm.values())
     if distance < before:
-        return distance, ""
+        return distance
     harmed = " and the ".join(harm).replace("_", " ")
-    return distance, f"it would make the {harmed} worse" if harm else "its predicted gain is too small"
+    raise NotUsed(f"it would make the {harmed} worse" if harm else "its predicted gain is too small")
 
 
 def _nearest_variant(context: Context, edit: Edit, iteration: Iteration) -> Iteration | None:

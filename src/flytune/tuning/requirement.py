@@ -14,10 +14,7 @@ from flytune.evaluation.statistics import quantile
 AXES = ("position", "x", "y", "z", "yaw")
 LONGEST = 60.0  # s
 LARGEST_MISS = 20.0  # also where the measure is infinite
-TRAINING_TOLERANCE, TRAINING_BOUNDS = (
-    0.5,
-    0.8,
-)  # of what is allowed on a validation set, the share allowed on the training set
+TRAINING_TOLERANCE, TRAINING_BOUNDS = 0.5, 0.8  # on the training set, as shares of those on a validation set
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -41,6 +38,11 @@ class ResponseSummary:
     def from_dict(cls, numbers: dict[str, Any]) -> "ResponseSummary":
         """The summary that `to_dict` has written."""
         return cls(**{name: math.inf if value is None else value for name, value in numbers.items()})
+
+
+NO_RESPONSE = ResponseSummary(
+    settling_time=math.inf, overshoot=math.inf, error=math.inf, settled=0.0, constraints_satisfied=0.0
+)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -77,6 +79,10 @@ class Requirement:
     def aim(self) -> float:
         """The settling time in s that an edit aims at."""
         return self.settling_time * (1.0 - self.tolerance / 2 if self.at_most else 1.0)
+
+    def trial_duration(self) -> float:
+        """The duration of a trial in s: 2.5 times the settling time, and at least 10 s."""
+        return float(math.ceil(max(10.0, 2.5 * self.settling_time)))
 
     def measure(self, *judgements: Judgement, constraints: tuple[str, ...] = ()) -> ResponseSummary:
         """The summary over all trials of some judgements; `constraints` names the terminations the user has set."""
@@ -131,10 +137,6 @@ class Requirement:
         """Sum of the weighted misses, 0 where the requirement is met."""
         return sum(self.weighted_misses(response).values())
 
-    def to_dict(self) -> dict[str, Any]:
-        """Plain numbers."""
-        return dataclasses.asdict(self)
-
     def __str__(self) -> str:
         degrees = self.axis == "yaw"
         error = f"{math.degrees(self.error):.3g} deg" if degrees else f"{1e3 * self.error:.3g} mm"
@@ -171,6 +173,10 @@ def make_requirement(
     Raises:
         BadInput: a number is out of range, or seems to be in another unit.
     """
+
+    def fraction_hint(value: float) -> str:
+        return f" Did you mean {100 * value:g}?" if 0 < value < 1 else ""
+
     if axis not in AXES:
         raise BadInput(f"axis: {axis!r} is not allowed. Allowed: {', '.join(AXES)}.")
     hint = f" Did you mean {settling_time / 1000:g} (seconds, not milliseconds)?" if settling_time >= 200 else ""
@@ -189,10 +195,8 @@ def make_requirement(
     if error > largest:
         hint = hint or f" Beyond {largest:g} {unit} a trial does not count as settled."
     _check("error", error, smallest, largest, unit, hint)
-    _check("tolerance", tolerance, 2.0, 50.0, "%", f" Did you mean {100 * tolerance:g}?" if 0 < tolerance < 1 else "")
-    _check(
-        "percentile", percentile, 1.0, 99.0, "%", f" Did you mean {100 * percentile:g}?" if 0 < percentile < 1 else ""
-    )
+    _check("tolerance", tolerance, 2.0, 50.0, "%", fraction_hint(tolerance))
+    _check("percentile", percentile, 1.0, 99.0, "%", fraction_hint(percentile))
     return Requirement(
         settling_time=float(settling_time),
         tolerance=tolerance / 100,

@@ -27,13 +27,17 @@ class Tuning:
         """Whether the best policy meets the requirement on a validation set."""
         return any(each.iteration == self.best and not each.misses for each in self.validations)
 
+    @property
+    def last_validation(self) -> Validation | None:
+        """The last validation of the best policy, None without one."""
+        return next((each for each in reversed(self.validations) if each.iteration == self.best), None)
+
     def why(self) -> str:
         """What misses the requirement in the best iteration, and why no further edit was made, in one line."""
-        misses = next((each.misses for each in reversed(self.validations) if each.iteration == self.best), {})
+        misses = describe_misses(self.last_validation.misses if self.last_validation else {}, self.requirement)
         reasons = "; ".join(self.stopped_because) or "no rule applies"
         return (
-            f"{describe_misses(misses, self.requirement)} (iteration {self.best}). The tuning stopped: {reasons}. "
-            f"The best policy is in {self.directory}."
+            f"{misses} (iteration {self.best}). The tuning stopped: {reasons}. The best policy is in {self.directory}."
         )
 
     def __repr__(self) -> str:
@@ -67,7 +71,7 @@ class Tuning:
             )
         return {
             "title": str(self.requirement),
-            "requirement": self.requirement.to_dict(),
+            "requirement": dataclasses.asdict(self.requirement),
             "start": self.start,
             "met": self.met,
             "best": self.best,

@@ -14,16 +14,19 @@ from flytune.config.document import Real
 from flytune.config.pytree import pytree
 from flytune.errors import BadInput
 from flytune.tables import Table
+from flytune.task.task import Task
 
-# symptom -> the measure that misses its requirement, and the direction in which a rule has to move it
+# symptom -> the measure that misses its requirement, and the direction in which a rule has to move it; in the order in
+# which symptoms are treated
 SYMPTOMS = {
+    "unsettled": ("settled", +1),
     "too slow": ("settling_time", -1),
     "too fast": ("settling_time", +1),
+    "violates a constraint": ("constraints_satisfied", +1),
     "overshoots": ("overshoot", -1),
     "inaccurate": ("error", -1),
-    "unsettled": ("settled", +1),
-    "violates a constraint": ("constraints_satisfied", +1),
 }
+SHARES = ("settled", "constraints_satisfied")  # the measures that are shares of the trials
 
 
 @pytree
@@ -69,7 +72,7 @@ class Rule:
         return SYMPTOMS[self.when][0]
 
 
-def load_rules(extra: Path | None = None) -> list[Rule]:
+def load_rules(extra: str | Path | None = None) -> list[Rule]:
     """The rules of flytune and those of the user's TOML file, which replace rules of the same name.
 
     Raises:
@@ -78,7 +81,7 @@ def load_rules(extra: Path | None = None) -> list[Rule]:
     with resources.as_file(resources.files("flytune.tuning") / "rules.toml") as path:
         rules = {rule.name: rule for rule in _read(path)}
     if extra is not None:
-        rules |= {rule.name: rule for rule in _read(extra)}
+        rules |= {rule.name: rule for rule in _read(Path(extra))}
     return list(rules.values())
 
 
@@ -91,35 +94,29 @@ def _read(path: Path) -> list[Rule]:
 
 def symptoms(misses: dict[str, float]) -> list[str]:
     """The symptoms that belong to the misses, in the order in which they should be treated."""
-    found = []
-    if "settled" in misses:
-        found.append("unsettled")
-    if "settling_time" in misses:
-        found.append("too slow" if misses["settling_time"] > 0 else "too fast")
-    for measure, symptom in (
-        ("constraints_satisfied", "violates a constraint"),
-        ("overshoot", "overshoots"),
-        ("error", "inaccurate"),
-    ):
-        if measure in misses:
-            found.append(symptom)
-    return found
+    return [name for name, (measure, direction) in SYMPTOMS.items() if misses.get(measure, 0.0) * direction < 0]
 
 
 def number_at(task: Mapping[str, Any], path: str) -> float | None:
     """The number at a field path of a task's tables; None where the task has no such number."""
-    number = _number_at(task, path)
-    return None if number is None else float(number)
-
-
-def is_whole(task: Mapping[str, Any], path: str) -> bool:
-    """Whether the number at a field path of a task's tables is an integer, and has to stay one."""
-    return isinstance(_number_at(task, path), int)
-
-
-def _number_at(task: Mapping[str, Any], path: str) -> int | float | None:
     value = nested.look_up(task, path)
-    return value if isinstance(value, int | float) and not isinstance(value, bool) else None
+    return float(value) if isinstance(value, int | float) and not isinstance(value, bool) else None
+
+
+def edited(task: Mapping[str, Any], values: Mapping[str, Any], reasons: Mapping[str, str]) -> Task:
+    """The task of some tables with other values (by field path), and the reasons for them among its sources.
+
+    A number that is an integer in the tables stays one.
+
+    Raises:
+        BadInput: the task cannot have these values.
+    """
+    tables = dict(task)
+    for path, value in values.items():
+        is_whole = type(nested.look_up(task, path)) is int
+        tables = nested.edit(tables, path, round(value) if is_whole else value)
+    tables["sources"] = {**tables.get("sources", {}), **reasons}
+    return document.read(Task, tables)
 
 
 def is_fixed(path: str, fixed: Sequence[str]) -> bool:
@@ -148,7 +145,7 @@ def _row(rule: Rule) -> tuple[str, ...]:
     low, high = map(float, rule.range)
     measure = rule.measure.replace("_", " ")
     expected = f"{measure} ~ field^{rule.slope:g}"
-    if rule.measure in ("settled", "constraints_satisfied"):
+    if rule.measure in SHARES:
         expected = "more trials settle" if rule.measure == "settled" else "fewer trials violate a constraint"
     guard = ", ".join(rule.requires).replace("_", " ")
     return (

@@ -1,15 +1,15 @@
 """Sensitivities: the measured effect of each parameter of a task on the response, all others as in baseline-refined."""
 
 import dataclasses
+import itertools
 import json
 import math
+import statistics
 from collections.abc import Mapping, Sequence
 from importlib import resources
 from typing import Any, Literal
 
 import numpy as np
-
-from flytune.evaluation.statistics import median
 
 FLOOR = {"settling_time": 1e-6, "overshoot": 0.002, "error": 1e-6}  # smaller values of a measure count as this one
 NO_EFFECT = {"settling_time": 0.1, "overshoot": 0.005, "error": 0.1}  # smaller changes over a whole curve are none
@@ -25,16 +25,18 @@ class SeedResult:
     settling_time: float | None  # s, median of the position
     overshoot: float | None  # fraction of the step, median of the position
     error: float | None  # m, median of the position
-    details: Mapping[str, Any]  # per axis, yaw error, violations, crashes
+    settling_time_axes: Mapping[str, float | None]  # the same for x, y, z and yaw
+    overshoot_axes: Mapping[str, float | None]
+    yaw_error: float | None  # rad, median
+    violations: Mapping[str, int]  # termination -> trials that violate it
+    crashed: int  # number of trials
 
     def number(self, measure: str, axis: str = "position") -> float:
         """A measure of an axis, +inf where too few trials have it; the error of x, y and z is that of the position."""
-        if axis == "position" or (measure == "error" and axis != "yaw"):
-            value = getattr(self, measure)
-        elif measure == "error":
-            value = self.details.get("yaw_error")
+        if measure == "error":
+            value = self.yaw_error if axis == "yaw" else self.error
         else:
-            value = self.details.get(f"{measure}_axes", {}).get(axis)
+            value = getattr(self, measure) if axis == "position" else getattr(self, f"{measure}_axes").get(axis)
         return math.inf if value is None else float(value)
 
 
@@ -51,8 +53,7 @@ class Point:
 
     def median(self, measure: str, axis: str = "position") -> float:
         """The median over the seeds."""
-        found = median(np.array(self.numbers(measure, axis)))
-        return math.inf if found is None else found
+        return statistics.median_low(self.numbers(measure, axis))
 
     def differs_from(self, other: "Point", measure: str, axis: str = "position") -> bool:
         """Whether the measure of every seed here is above, or below, that of every seed at the other value."""
@@ -72,11 +73,9 @@ class Curve:
 
         Beyond the ends these are the outermost two points. A value of 0 is left out.
         """
-        points = [point for point in self.points if point.value > 0]
-        beyond = [point.value > value if up else point.value >= value for point in points]
-        upper = beyond.index(True) if True in beyond else len(points) - 1
-        upper = max(1, upper)
-        return points[upper - 1], points[upper]
+        pairs = list(itertools.pairwise(point for point in self.points if point.value > 0))
+        around = (pair for pair in pairs if (pair[1].value > value if up else pair[1].value >= value))
+        return next(around, pairs[-1])
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -161,27 +160,15 @@ class Sensitivities:
 
 def load_sensitivities() -> Sensitivities:
     """The sensitivities that ship with flytune, measured by `python benchmarks/sensitivity.py`."""
-    return read_sensitivities((resources.files("flytune.tuning") / "sensitivity.json").read_text(encoding="utf-8"))
-
-
-def read_sensitivities(text: str) -> Sensitivities:
-    """The sensitivities of a JSON text."""
-    told = json.loads(text)
-    named = ("seed", "settled", "settling_time", "overshoot", "error")
-
-    def result(row: dict[str, Any]) -> SeedResult:
-        details = {name: value for name, value in row.items() if name not in named}
-        return SeedResult(**{name: row[name] for name in named}, details=details)
-
+    facts = json.loads((resources.files("flytune.tuning") / "sensitivity.json").read_text(encoding="utf-8"))
     parameters = {
         path: Curve(
             baseline=curve["baseline"],
             points=[
-                Point(value=point["value"], seeds=[result(row) for row in point["seeds"]]) for point in curve["points"]
+                Point(value=point["value"], seeds=[SeedResult(**seed) for seed in point["seeds"]])
+                for point in curve["points"]
             ],
         )
-        for path, curve in told["parameters"].items()
+        for path, curve in facts.pop("parameters").items()
     }
-    return Sensitivities(
-        facts={name: value for name, value in told.items() if name != "parameters"}, parameters=parameters
-    )
+    return Sensitivities(facts=facts, parameters=parameters)

@@ -14,17 +14,21 @@ WEAK = 0.25  # a slope between iterations is ignored below this share of the mea
 MEASURES = ("settling_time", "overshoot", "error")  # those with measured sensitivities
 
 
+class NotUsed(Exception):
+    """Why a rule is not used on an iteration."""
+
+
 @dataclasses.dataclass(frozen=True)
 class Context:
-    """Everything that the choice of an edit depends on; `choose` explains each field."""
+    """Everything that the choice of an edit depends on."""
 
-    iterations: Sequence[Iteration]
-    tables: Mapping[str, Any]
-    requirement: Requirement
-    rules: Sequence[Rule]
+    iterations: Sequence[Iteration]  # all so far; the first one is the start
+    tables: Mapping[str, Any]  # the task of the start, as nested tables
+    requirement: Requirement  # on the training set
+    rules: Sequence[Rule]  # that may be used
     sensitivities: Sensitivities
-    fixed: Sequence[str]
-    trainer: str
+    fixed: Sequence[str]  # field paths that the user has set; they, and all fields below them, are not edited
+    trainer: str  # its name; rules for settings of other trainers are left out
 
     @property
     def same_trainer(self) -> bool:
@@ -41,12 +45,16 @@ class Slope:
     between: tuple[float, float] | None  # values of the field that it was measured between
 
 
-def find_slope(context: Context, rule: Rule, value: float, iteration: Iteration) -> Slope | str:
-    """The slope of the rule's measure at a value of its field; or the reason why the rule does not apply there."""
+def find_slope(context: Context, rule: Rule, value: float, iteration: Iteration) -> Slope:
+    """The slope of the rule's measure at a value of its field.
+
+    Raises:
+        NotUsed: the measured effect there is zero, or opposite to that of the rule.
+    """
     up = rule.direction == "up"
     known, what = context.sensitivities, (rule.field, rule.measure, value, context.requirement.axis, up)
-    sensitivity = known.slope(*what) if rule.measure in MEASURES else None
-    holds = sensitivity is not None and sensitivity * rule.slope > 0 and known.is_significant(*what)
+    measured = known.slope(*what) if rule.measure in MEASURES else None
+    confirmed = measured is not None and measured * rule.slope > 0 and known.is_significant(*what)
     found = []
     for other, there in variants(iteration, rule.field, context.iterations):
         if other is iteration or abs(math.log(there / value)) < SAME:
@@ -57,16 +65,16 @@ def find_slope(context: Context, rule: Rule, value: float, iteration: Iteration)
     if found:
         _, power, there = min(found)
         # a weak slope on this side of a known threshold predicts nothing beyond the threshold
-        weak = holds and sensitivity is not None and abs(power) < WEAK * abs(sensitivity)
+        weak = measured is not None and confirmed and abs(power) < WEAK * abs(measured)
         usable = not weak or known.same_interval(rule.field, value, up, there)
         if usable and power * rule.slope > 0 and abs(power) > 0.1 * abs(float(rule.slope)):
             return Slope(power, "iterations", (value, there))
-    if holds and sensitivity is not None:
+    if measured is not None and confirmed:
         low, high = known.parameters[rule.field].interval(value, up)
-        return Slope(sensitivity, "sensitivity", (low.value, high.value))
-    if sensitivity is None or not context.same_trainer:
+        return Slope(measured, "sensitivity", (low.value, high.value))
+    if measured is None or not context.same_trainer:
         return Slope(float(rule.slope), "rule", None)
-    return f"its measured effect there is {'opposite' if known.is_significant(*what) else 'zero'}"
+    raise NotUsed(f"its measured effect there is {'opposite' if known.is_significant(*what) else 'zero'}")
 
 
 def interpolated(
@@ -84,28 +92,21 @@ def interpolated(
         wanted: d log(measure) that is wanted.
         slope: the slope found so far.
     """
-    bracket = None
-    if rule.measure == "settling_time":
-        bracket = _bracket(rule, iteration, context.iterations, context.requirement.aim())
-    if bracket is None:
+    if rule.measure != "settling_time" or (bracket := _bracket(context, rule, iteration)) is None:
         return slope
     slow, fast, share = bracket
     goal = slow + share * (fast - slow)
     change = wanted / slope.power
-    inside = 0.05 < (math.log(value) + change - slow) / (fast - slow) < 0.95
-    behind = (
-        slope.known_from == "iterations"
-        and slope.between is not None
-        and math.log(slope.between[1] / value) * change < 0
-    )
-    if (behind and inside) or abs(goal - math.log(value)) < 1e-9:
+    if slope.known_from == "iterations" and slope.between is not None:
+        is_behind = math.log(slope.between[1] / value) * change < 0
+        if is_behind and 0.05 < (math.log(value) + change - slow) / (fast - slow) < 0.95:
+            return slope
+    if abs(goal - math.log(value)) < 1e-9:
         return slope
     return Slope(wanted / (goal - math.log(value)), "interpolation", (math.exp(slow), math.exp(fast)))
 
 
-def _bracket(
-    rule: Rule, iteration: Iteration, iterations: Sequence[Iteration], aim: float
-) -> tuple[float, float, float] | None:
+def _bracket(context: Context, rule: Rule, iteration: Iteration) -> tuple[float, float, float] | None:
     """The log of the field in the nearest slower and faster iterations, and the share of the way from one to the other.
 
     None where one of the two does not exist. An end that stays while further iterations fall on the other side is
@@ -115,8 +116,8 @@ def _bracket(
     Source: Dowell and Jarratt 1971, A modified regula falsi method for computing the root of an equation.
     """
     around = [
-        (math.log(each.response.settling_time / aim), math.log(there), each.number)
-        for each, there in variants(iteration, rule.field, iterations)
+        (math.log(each.response.settling_time / context.requirement.aim()), math.log(there), each.number)
+        for each, there in variants(iteration, rule.field, context.iterations)
         if math.isfinite(each.response.settling_time) and each.response.settling_time > 0
     ]
     slower, faster = [point for point in around if point[0] > 0], [point for point in around if point[0] <= 0]

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from flytune.config import document, nested
+from flytune.config import document
 from flytune.control.classical import classical_controller
 from flytune.control.policy import Policy, load_policy
 from flytune.errors import BadInput
@@ -18,7 +18,7 @@ from flytune.training.trainer import find_trainer
 from flytune.tuning.feasibility import check_feasible
 from flytune.tuning.history import TRAINING_SEED, TRAINING_TRIALS
 from flytune.tuning.requirement import Requirement
-from flytune.tuning.rules import is_fixed
+from flytune.tuning.rules import edited, is_fixed
 
 KNOWN = ("acrobatic-refined", "baseline-refined", "inspection-refined")  # fastest first
 WITHOUT_POLICY = "baseline-refined"  # the task to begin with where no known policy settles
@@ -35,11 +35,6 @@ class Start:
     files: tuple[Path, Path] | None  # the policy, and run.json of its training; None where none is known
     judgement: Judgement | None  # of the policy on the training set
     times: Mapping[str, float]  # known task -> settling time in s of its policy, with the user's fields
-
-
-def tuning_duration(requirement: Requirement) -> float:
-    """The duration of a trial in s: 2.5 times the wanted settling time, and at least 10 s."""
-    return float(math.ceil(max(10.0, 2.5 * requirement.settling_time)))
 
 
 def find_start(requirement: Requirement, wanted: str | None, edits: Mapping[str, Any], trainer: str) -> Start:
@@ -59,41 +54,33 @@ def find_start(requirement: Requirement, wanted: str | None, edits: Mapping[str,
     anyone = classical_controller("lqr", load_task("baseline"), "tuned")  # only the initial conditions are used
     flights = fly(anyone, first, trials=TRAINING_TRIALS, seed=TRAINING_SEED, duration=0.6)
     check_feasible(first, requirement, flights, tuple(edits))
-    files = {name: found for name, task in tasks.items() if (found := _shipped(name, task, trainer)) is not None}
-    policies = {name: load_policy(found[0]) for name, found in files.items()}
-    judgements = {
-        name: fly_for(requirement, policy, tasks[name], TRAINING_SEED, TRAINING_TRIALS)
-        for name, policy in policies.items()
-    }
-    responses = {name: requirement.measure(judgement) for name, judgement in judgements.items()}
-    times = {name: each.settling_time if each.settled >= 0.5 else math.inf for name, each in responses.items()}
-    near = {name: abs(math.log(max(time, 1e-3) / requirement.aim())) for name, time in times.items()}
-    usable = [name for name in near if math.isfinite(near[name])]
-    otherwise = WITHOUT_POLICY if WITHOUT_POLICY in tasks else next(iter(tasks))
-    name = min(usable, key=near.__getitem__) if usable else otherwise
+    name = WITHOUT_POLICY if WITHOUT_POLICY in tasks else next(iter(tasks))
+    files = judgement = None
+    times: dict[str, float] = {}
+    smallest = math.inf
+    for known, task in tasks.items():
+        if (found := _shipped(known, task, trainer)) is None:
+            continue
+        judged = fly_for(requirement, load_policy(found[0]), task, TRAINING_SEED, TRAINING_TRIALS)
+        response = requirement.measure(judged)
+        times[known] = response.settling_time if response.settled >= 0.5 else math.inf
+        ratio = abs(math.log(max(times[known], 1e-3) / requirement.aim()))
+        if ratio < smallest:
+            smallest, name, files, judgement = ratio, known, found, judged
     task = dataclasses.replace(tasks[name], name=f"{tasks[name].name}-tuned-{requirement.settling_time:g}s")
     return Start(
         name=name,
         task=_prepared(task, requirement, trainer, True, tuple(edits)),
         first=_prepared(task, requirement, trainer, False, tuple(edits)),
-        files=files[name] if usable else None,
-        judgement=judgements[name] if usable else None,
+        files=files,
+        judgement=judgement,
         times=times,
     )
 
 
 def fly_for(requirement: Requirement, policy: Policy, task: Task, seed: int, trials: int) -> Judgement:
     """The judgement of a policy on trials that are long enough for the requirement."""
-    return judge(fly(policy, task, trials=trials, seed=seed, duration=tuning_duration(requirement)))
-
-
-def edited(task: Task, changes: Mapping[str, tuple[Any, str]]) -> Task:
-    """The task with some fields changed; the reason of each change becomes its source."""
-    tables = document.plain(task)
-    for path, (value, why) in changes.items():
-        tables = nested.edit(tables, path, value)
-        tables["sources"] = {**tables.get("sources", {}), path: why}
-    return document.read(Task, tables)
+    return judge(fly(policy, task, trials=trials, seed=seed, duration=requirement.trial_duration()))
 
 
 def _prepared(task: Task, requirement: Requirement, trainer: str, warm_start: bool, fixed: tuple[str, ...]) -> Task:
@@ -105,14 +92,16 @@ def _prepared(task: Task, requirement: Requirement, trainer: str, warm_start: bo
     while horizon < 150 * requirement.settling_time:
         horizon *= 2
     wanted: dict[str, tuple[Any, str]] = {
-        "duration": (tuning_duration(requirement), "tuned: trials last more than twice the wanted settling time")
+        "duration": (requirement.trial_duration(), "tuned: trials last more than twice the wanted settling time")
     }
     if horizon > task.horizon:
         wanted["horizon"] = (horizon, "tuned: the episodes last longer than the wanted response")
     method = find_trainer(trainer)
     settings = method.settings(task).tuned(slow=requirement.settling_time >= SLOW, warm_start=warm_start)
     wanted |= {f"{method.settings_field}.{name}": change for name, change in settings.items()}
-    return edited(task, {path: what for path, what in wanted.items() if not is_fixed(path, fixed)})
+    free = {path: change for path, change in wanted.items() if not is_fixed(path, fixed)}
+    values = {path: value for path, (value, _) in free.items()}
+    return edited(document.plain(task), values, {path: reason for path, (_, reason) in free.items()})
 
 
 def _known_tasks(edits: Mapping[str, Any]) -> dict[str, Task]:

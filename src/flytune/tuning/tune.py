@@ -8,6 +8,7 @@ from typing import Any
 
 from flytune.errors import BadInput, Interrupted
 from flytune.report.tuning import write_tuning
+from flytune.runs.directory import new_directory
 from flytune.training.loop import Progress
 from flytune.training.trainer import DEFAULT_TRAINER, find_trainer
 from flytune.tuning.loop import Tuner
@@ -73,7 +74,7 @@ def tune(
         settling_time, overshoot, error, at_most=at_most, tolerance=tolerance, axis=axis, percentile=percentile
     )
     if rules is None or isinstance(rules, str | Path):
-        rules = load_rules(None if rules is None else Path(rules))
+        rules = load_rules(rules)
     directory = _directory(out, requirement, resume)
     find_trainer(trainer, every_task=True)
     if not 1 <= most_iterations <= 100:
@@ -82,8 +83,8 @@ def tune(
         raise BadInput(f"seed: {seed} is not allowed. Allowed: a whole number, 0 to {2**32 - 1}.")
     say = on_message or (lambda _: None)
     tuner = Tuner(
-        requirement, rules, directory, task=task, edits=edits or {}, seed=seed, trainer=trainer,
-        most_iterations=most_iterations, on_message=say, on_progress=on_progress,
+        requirement=requirement, rules=rules, out=directory, task=task, edits=dict(edits or {}), seed=seed,
+        trainer=trainer, most_iterations=most_iterations, on_message=say, on_progress=on_progress,
     )  # fmt: skip
     if resume:
         tuner.history.read()
@@ -110,11 +111,7 @@ def _directory(out: str | Path | None, requirement: Requirement, resume: bool) -
     if out is None:
         if resume:
             raise BadInput("resume: needs --out DIR, the directory of the tuning to continue.")
-        base = Path("runs") / f"tune-{requirement.settling_time:g}s"
-        path, number = base, 2
-        while path.exists():
-            path, number = base.with_name(f"{base.name}-{number}"), number + 1
-        return path
+        return new_directory(f"tune-{requirement.settling_time:g}s")
     directory = Path(out)
     # not Path.exists, which raises where a name is too long
     if os.path.exists(directory) and not os.path.isdir(directory):

@@ -1,4 +1,7 @@
-"""The sensitivities as a drawing and as tables, beside the claims of the paper about each parameter (H1 to H11)."""
+"""The sensitivities as a drawing and as tables, beside the paper's claims about each parameter (H1 to H11).
+
+Written into the documentation by `python benchmarks/sensitivity.py --docs`.
+"""
 
 import math
 from pathlib import Path
@@ -95,9 +98,7 @@ def draw_sensitivities(path: Path, sensitivities: Sensitivities) -> None:
 
 def _row(point: Point, baseline: float) -> tuple[str | Cell, ...]:
     settled = [result.settled for result in point.seeds]
-    crossed = [
-        sum(n for name, n in result.details.get("violations", {}).items() if "speed" in name) for result in point.seeds
-    ]
+    crossed = [sum(n for name, n in result.violations.items() if "speed" in name) for result in point.seeds]
     value = Cell(text=f"{point.value:g}", tone="strong" if point.value == baseline else "")
     cells = []
     for measure, _, scale in MEASURES:
