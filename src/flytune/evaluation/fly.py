@@ -207,7 +207,7 @@ def _rollout_on_device(
     )
     states, actions = step.record
     states = jnp.concatenate([starts[None], states])
-    actions = jnp.concatenate([episodes.last_action[None] * 0, actions])
+    actions = jnp.concatenate([jnp.zeros_like(actions[:1]), actions])
     return Record(states, actions, episodes.steps < 0), *step.notes
 
 
