@@ -302,3 +302,60 @@ def test_vehicles_with_lag_and_latency_are_flown_too():
     np.testing.assert_allclose(flights.rotor_speed_rpm[:, :3], hover, rtol=1e-5)  # two steps late, still hover
     assert np.abs(flights.rotor_speed_rpm[:, 4] - hover).max() > 1
     assert jax.tree.all(jax.tree.map(lambda part: np.isfinite(part).all(), flights.margins))
+
+
+class Plain:
+    """A controller that is no JAX pytree."""
+
+    def initial_memory(self):
+        """Nothing."""
+        return ()
+
+    def act(self, memory, observation):
+        """Hover."""
+        return memory, jnp.zeros(4)
+
+
+@pytree
+class Three:
+    """A controller with three actions."""
+
+    def initial_memory(self):
+        """Nothing."""
+        return ()
+
+    def act(self, memory, observation):
+        """Three zeros."""
+        return memory, jnp.zeros(3)
+
+
+@pytree
+class Forgetful:
+    """A controller that gives no memory back."""
+
+    def initial_memory(self):
+        """A count."""
+        return jnp.zeros(())
+
+    def act(self, memory, observation):
+        """Hover."""
+        return (), jnp.zeros(4)
+
+
+@pytest.mark.parametrize(
+    ("controller", "line"),
+    [
+        (Plain(), "controller: Plain is no JAX pytree. Decorate its class"),
+        (Three(), r"controller: Three.act gives an action of shape \(3,\). Allowed: \(4,\)."),
+        (Forgetful(), "controller: Forgetful.act gives the memory"),
+        (lambda observation: observation, "controller: function is not allowed. Allowed: an object with"),
+    ],
+)
+def test_a_controller_that_cannot_be_flown_is_refused_in_one_line(task, controller, line):
+    with pytest.raises(BadInput, match=line):
+        fly(controller, task)
+
+
+def test_options_beside_a_simulator_of_ones_own_are_refused(task):
+    with pytest.raises(BadInput, match="simulator_options: are not allowed with a simulator of your own"):
+        fly(Echo(gain=0.0), task, simulator=lambda vehicle, number: None, simulator_options={"physics_steps": 2})

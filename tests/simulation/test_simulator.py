@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+from typing import get_args, get_type_hints
 
 import jax
 import jax.numpy as jnp
@@ -9,6 +10,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from flytune.cli.options import FlightOptions
 from flytune.errors import BadInput
 from flytune.physics import dynamics
 from flytune.physics.vehicle import load_vehicle
@@ -208,5 +210,6 @@ def test_flytunes_world_is_flytunes_physics(late):
         np.testing.assert_allclose(found, np.array(getattr(state, name)), atol=1e-6, rtol=1e-6, err_msg=name)
 
 
-def test_there_are_three_worlds():
-    assert SIMULATORS == ("flytune", "pybullet", "mujoco")
+def test_the_command_line_offers_every_simulator():
+    choices = get_args(get_type_hints(FlightOptions)["simulator"])
+    assert choices == SIMULATORS

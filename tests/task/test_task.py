@@ -286,6 +286,21 @@ def test_a_file_based_on_a_preset_says_only_what_it_changes(tmp_path):
     assert task.sources["reward.velocity.weight"] == "mine" and task.sources["reward"] == "paper R11"
 
 
+def test_what_a_file_changes_has_the_file_as_its_source_and_not_the_paper(tmp_path):
+    file = tmp_path / "mine.toml"
+    file.write_text(
+        'based_on = "baseline"\n[reward.survival]\nreward = 0.1\n'
+        '[reward.level]\nkind = "exponential"\nof = "attitude"\n'
+        "weight = 0.2\nsharpness = 1.0\n"
+        '[sources]\n"reward.level" = "measured in the laboratory"\n'
+    )
+    lines = write_task(load_task(file)).splitlines()
+    sources = {name: [line.rsplit("; ", 1)[-1] for line in lines if line.startswith(f"{name} =")] for name in
+               ("reward", "weight", "wide")}  # fmt: skip
+    assert sources["reward"][0] == "set in mine.toml"
+    assert "measured in the laboratory" in sources["weight"] and "set in mine.toml" not in sources["wide"]
+
+
 def test_a_file_based_on_nothing_that_ships_is_refused(tmp_path):
     file = tmp_path / "mine.toml"
     file.write_text('based_on = "besaline"\n')

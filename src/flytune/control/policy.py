@@ -107,9 +107,15 @@ def load_policy(path: Path) -> Policy:
             header = json.loads((file.metadata() or {}).get(HEADER, "{}"))
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118  (not a dict)
     except FileNotFoundError:
-        raise BadInput(f"{path}: no such file. Give a run directory or a .safetensors policy.") from None
+        raise BadInput(
+            f"{path}: no such file. Give a .safetensors policy; flytune.find_controller also takes run directories and "
+            "the names of policies that ship."
+        ) from None
     except (safetensors.SafetensorError, OSError, ValueError) as error:
-        raise BadInput(f"{path}: is not a policy ({error}). Give a .safetensors file written by flytune.") from None
+        raise BadInput(
+            f"{path}: is not a policy ({error}). Give a .safetensors file written by flytune; a controller of your own "
+            "flies from Python, see examples/own_controller.py."
+        ) from None
     header = header if isinstance(header, dict) else {}
     if header.get("format") != FORMAT:
         raise BadInput(f"{path}: is not a flytune policy (format {header.get('format')!r}). Allowed: {FORMAT}.")

@@ -74,12 +74,17 @@ def fly(
         )
     if not 0 <= seed < 2**32:
         raise BadInput(f"seed: {seed} is not allowed. Allowed: a whole number, 0 to {2**32 - 1}.")
+    _check_controller(controller)
     steps = round(duration / CONTROL_PERIOD)
     initial_state = EVALUATION_INITIAL_STATES[initial_conditions]
     starts, noise_keys = _begin(task, initial_state, trial_keys(seed, trials))
     if isinstance(simulator, str):
         simulator_name, made = simulator, make_simulator(simulator, task.vehicle, trials, simulator_options)
     else:
+        if simulator_options:
+            raise BadInput(
+                "simulator_options: are not allowed with a simulator of your own. Give them to its function."
+            )
         simulator_name, made = getattr(simulator, "__name__", "custom"), simulator(task.vehicle, trials)
     try:
         record = rollout_trials(made, controller, task, starts, noise_keys, steps, name)
@@ -103,6 +108,32 @@ def fly(
         seed=seed,
         initial_conditions=initial_conditions,
     )
+
+
+def _check_controller(controller: Any) -> None:
+    """Refuse a controller that the rollout cannot fly, before anything is compiled.
+
+    Raises:
+        BadInput: it is no JAX pytree, lacks a function, or its action or memory has another shape.
+    """
+    name = type(controller).__name__
+    if not isinstance(controller, Controller):
+        raise BadInput(f"controller: {name} is not allowed. Allowed: an object with `initial_memory()` and `act(...)`.")
+    if any(leaf is controller for leaf in jax.tree.leaves(controller)):
+        raise BadInput(
+            f"controller: {name} is no JAX pytree. Decorate its class with jax.tree_util.register_dataclass, or see "
+            "examples/own_controller.py."
+        )
+    before = jax.eval_shape(lambda each: each.initial_memory(), controller)
+    seen = jax.ShapeDtypeStruct((SIZE,), np.float32)
+    after, action = jax.eval_shape(lambda each, *given: each.act(*given), controller, before, seen)
+    if jnp.shape(action) != (4,):
+        raise BadInput(f"controller: {name}.act gives an action of shape {jnp.shape(action)}. Allowed: (4,).")
+    kinds = [jax.tree.map(lambda leaf: (leaf.shape, leaf.dtype), memory) for memory in (before, after)]
+    if kinds[0] != kinds[1]:
+        raise BadInput(
+            f"controller: {name}.act gives the memory {kinds[1]}. Allowed: as in initial_memory, {kinds[0]}."
+        )
 
 
 class Record(NamedTuple):

@@ -33,8 +33,9 @@ def thrust_bound(
 ) -> Float[np.ndarray, "N"]:
     """Least time in s that any controller takes from rest into the band around the target, to stay there.
 
-    The way to the band, D = distance - 0.02 m, is flown with the largest acceleration `forwards` (m/s^2) and then with
-    the largest deceleration `backwards` (m/s^2), down to the speed that can still be lost within the width of the band:
+    The way to the band, D = distance - POSITION_BAND, is flown with the largest acceleration `forwards` (m/s^2) and
+    then with the largest deceleration `backwards` (m/s^2), down to the speed that can still be lost within the width
+    of the band:
 
         v = sqrt(2 backwards 0.04),  vp^2 / (2 forwards) + (vp^2 - v^2) / (2 backwards) = D,
         t = vp / forwards + (vp - v) / backwards

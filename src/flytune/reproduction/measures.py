@@ -82,7 +82,8 @@ def steady_state(evidence: Evidence, weights: Weights) -> ClaimMeasures:
         yaw = _values(evidence, behaviour, weights, lambda judged: np.degrees(judged.steady_state_error["yaw"]))
         context.append(median_of_trials(f"{behaviour}: steady-state error, position", position, "m"))
         context.append(median_of_trials(f"{behaviour}: steady-state error, yaw", yaw, "deg"))
-    reading = _shares(evidence, weights, "trials within 2 cm in x, y, z and 3.6 deg in yaw", within)
+    what = f"trials within {100 * POSITION_BAND:g} cm in x, y, z and {math.degrees(YAW_BAND):g} deg in yaw"
+    reading = _shares(evidence, weights, what, within)
     return ClaimMeasures(reading=reading, context=context)
 
 

@@ -42,7 +42,10 @@ class Simulator(Protocol):
 
     @property
     def physics(self) -> Callable[..., Any] | None:
-        """One control period as a function in JAX, (vehicle, State, action) -> State; None where there is none."""
+        """One control period as a function in JAX, (vehicle, State, action) -> State; None where there is none.
+
+        Where there is one, flights and trainings use it alone, with the vehicle of the task.
+        """
         ...
 
     def place(self, states: VehicleStates, which: Int[np.ndarray, "K"] | None = None) -> None:

@@ -13,7 +13,9 @@ from flytune.physics import rotation
 from flytune.physics.components import Components, unpack
 from flytune.physics.dynamics import State
 
-POSITION_BAND = 0.02  # m; on x, y, z and on the distance to the target: within it, a response counts as settled
+# m; on x, y, z and on the distance to the target: within it, a response counts as settled. The paper says 2 % and not
+# of what; this is 2 % of the target's height of 1 m (C5)
+POSITION_BAND = 0.02
 YAW_BAND = 0.02 * math.pi  # rad; 2 % of 180 deg
 
 

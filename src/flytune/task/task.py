@@ -125,7 +125,7 @@ def load_task(task: str | Path, edits: dict[str, Any] | None = None) -> Task:
     if name in preset_names():
         data, where = _preset(name), ""
     elif name.endswith(".toml") or os.path.isfile(name):
-        data = _on_its_base({"name": Path(name).stem, **document.load(Path(name))}, name)
+        data = _on_its_base(_with_sources({"name": Path(name).stem, **document.load(Path(name))}, name), name)
         where = name
     else:
         hint = document.nearest(name, preset_names())
@@ -157,6 +157,17 @@ def _on_its_base(data: dict[str, Any], where: str) -> dict[str, Any]:
     if base not in preset_names():
         raise BadInput(f"{where}: based_on: {base!r} is no preset. Allowed: {', '.join(preset_names())}.")
     return nested.overlay(_preset(base), changes)
+
+
+def _with_sources(data: dict[str, Any], file: str) -> dict[str, Any]:
+    """The tables of a file that changes a preset; the source of each changed value without one is the file."""
+    sources = data.get("sources", {})
+    if "based_on" not in data or not isinstance(sources, dict):  # else it is refused, with its name, when it is read
+        return data
+    changed = {key: value for key, value in data.items() if key not in ("based_on", "vehicle")}
+    paths = (path for path, _ in nested.leaves(changed, skip=nested.LABELS))
+    text = f"set in {Path(file).name}"
+    return {**data, "sources": {path: text for path in paths if not document.source_of(path, sources)} | sources}
 
 
 def read_task_text(text: str, where: str) -> Task:

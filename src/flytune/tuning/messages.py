@@ -4,6 +4,7 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from flytune.evaluation.metrics import POSITION_BAND, YAW_BAND
 from flytune.tuning.iteration import HALF_WAY, Edit, Iteration
 from flytune.tuning.requirement import LARGEST_MISS, Requirement, ResponseSummary
 
@@ -41,7 +42,7 @@ def describe_target(target: Requirement, trials: int, duration: float) -> str:
     """The requirement on the training set, and when a trial counts as settled."""
     lowest, highest = (1 - target.tolerance) * target.settling_time, target.maximum_settling_time()
     time = f"at most {highest:.2f} s" if target.at_most else f"{lowest:.2f} to {highest:.2f} s"
-    band = "3.6 deg" if target.axis == "yaw" else "2 cm"
+    band = f"{math.degrees(YAW_BAND):g} deg" if target.axis == "yaw" else f"{100 * POSITION_BAND:g} cm"
     return (
         f"{trials} trials of {duration:g} s; required there: {time}, overshoot at most "
         f"{with_unit('overshoot', target.overshoot, target)}, error at most "

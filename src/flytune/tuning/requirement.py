@@ -9,6 +9,7 @@ import numpy as np
 
 from flytune.errors import BadInput
 from flytune.evaluation.judge import Judgement
+from flytune.evaluation.metrics import POSITION_BAND, YAW_BAND
 from flytune.evaluation.statistics import quantile
 
 AXES = ("position", "x", "y", "z", "yaw")
@@ -187,7 +188,8 @@ def make_requirement(
             f"Did you mean {100 * overshoot:g} (percent of the step, not a fraction)?"
         )
     _check("overshoot", overshoot, 0.0, 100.0, "%")
-    unit, smallest, largest = ("deg", 0.02, 3.6) if axis == "yaw" else ("m", 0.0002, 0.02)
+    band = math.degrees(YAW_BAND) if axis == "yaw" else POSITION_BAND
+    unit, smallest, largest = ("deg", 0.02, round(band, 9)) if axis == "yaw" else ("m", 0.0002, band)
     if error is None:
         error = 1.0 if axis == "yaw" else 0.01
     millimetres = axis != "yaw" and 1 <= error <= 20
