@@ -16,10 +16,14 @@ os.environ.setdefault("XLA_FLAGS", "--xla_cpu_multi_thread_eigen=false intra_op_
 os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(Path(__file__).parents[1] / ".jax_cache"))
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.3")
 
+import hypothesis
 import jax
 from beartype import BeartypeConf, FrozenDict, beartype
 from jaxtyping import install_import_hook
 from tests.chromium import BROWSERS, ON_A_MAC, Browser
+
+hypothesis.settings.register_profile("flytune", deadline=None)  # no test depends on how busy the machine is
+hypothesis.settings.load_profile("flytune")
 
 # A float may be an int, and in compiled code it is a tracer. Beartype knows no Self outside of a decorated class.
 RULES = BeartypeConf(hint_overrides=FrozenDict({float: float | int | jax.Array, Self: object}))

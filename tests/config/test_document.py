@@ -111,7 +111,7 @@ def test_a_yes_or_no_is_written_and_read_back(locked):
     assert document.read(Door, tomllib.loads(text)).locked is locked
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=100)
 @given(st.floats(0, allow_infinity=False, allow_subnormal=True))
 def test_every_number_is_written_to_its_last_bit(mass):
     text = document.write(Car(mass=mass, doors=2, centre=(0.0, 0.0, 0.0), wheels={"left": Wheel(radius=0.3)}))

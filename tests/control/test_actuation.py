@@ -35,7 +35,7 @@ def delivered(vehicle, thrust, torque):
 
 
 @pytest.mark.parametrize("name", VEHICLES)
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 @given(action=actions)
 def test_allocating_what_rotors_give_gives_back_the_rotors(name, action):
     speeds, back = there_and_back(VEHICLES[name], tuple(map(jnp.float32, action)))
@@ -81,7 +81,7 @@ def test_thrust_gives_way_to_roll_and_pitch(name):
 
 
 @pytest.mark.parametrize("name", VEHICLES)
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 @given(numbers=st.lists(st.floats(-50, 50, width=32), min_size=4, max_size=4))
 def test_whatever_is_asked_for_the_rotors_stay_in_the_range_of_the_actions(name, numbers):
     vehicle = VEHICLES[name]
@@ -110,7 +110,7 @@ def test_mixing_squares_is_the_mixer_of_the_physics():
 
 
 @pytest.mark.parametrize("name", LAYOUTS)
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 @given(action=actions)
 def test_allocating_what_the_rotors_of_any_layout_give_gives_back_the_rotors(name, action):
     speeds, back = there_and_back(with_layout(name), tuple(map(jnp.float32, action)))

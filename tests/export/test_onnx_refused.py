@@ -288,7 +288,7 @@ def good():
 
 
 @settings(
-    max_examples=400, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture], derandomize=True
+    max_examples=400, suppress_health_check=[HealthCheck.function_scoped_fixture], derandomize=True
 )
 @given(data=st.data())
 def test_a_file_damaged_anywhere_is_refused_in_one_line_or_gives_finite_actions(good, data):

@@ -26,7 +26,7 @@ quaternions = (
     .filter(lambda q: math.hypot(*q) > 0.1)
     .map(lambda q: tuple(part / math.hypot(*q) for part in q))
 )
-quick = settings(max_examples=50, deadline=None)
+quick = settings(max_examples=50)
 
 
 def compiled(name, *arguments):
