@@ -287,9 +287,7 @@ def good():
     return content
 
 
-@settings(
-    max_examples=400, suppress_health_check=[HealthCheck.function_scoped_fixture], derandomize=True
-)
+@settings(max_examples=400, suppress_health_check=[HealthCheck.function_scoped_fixture], derandomize=True)
 @given(data=st.data())
 def test_a_file_damaged_anywhere_is_refused_in_one_line_or_gives_finite_actions(good, data):
     content = bytearray(good)
