@@ -111,7 +111,7 @@ def loss(actor, episodes, key):
     def decide(memory, observation, drawn, episodes):
         return memory, jnp.tanh(actor(see(observation, episodes.numbers))), ()
 
-    (episodes, _), step = rollout(family, decide, (episodes, ()), draws, record=worth, slack=SLACK, rematerialise=True)
+    (episodes, _), step = rollout(family, decide, (episodes, ()), draws, record=worth, slack=SLACK)
     return -jnp.mean(step.record), episodes
 
 

@@ -14,7 +14,6 @@ from flytune.benchmark.baselines import Measurement, fastest
 from flytune.errors import BadInput
 from flytune.simulation.environment import Episode
 from flytune.simulation.rollout import Draw, reset_all, rollout
-from flytune.task.observation import NOISY
 from flytune.task.task import Task, load_task
 from flytune.task.training_settings import PpoSettings
 from flytune.training.trainer import TRAINERS, Trainer
@@ -148,7 +147,7 @@ def _simulation(task: Task) -> Callable[[], Any]:
     def fly(episodes: Episode, key: jax.Array) -> Any:
         noise_key, reset_key = jax.random.split(key)
         draws = Draw(
-            noise=jax.random.normal(noise_key, (steps, NOISY, environments)),
+            noise=jax.random.split(noise_key, (steps, environments)),
             keys=jax.random.split(reset_key, (steps, environments)),
         )
         record = rollout(task, decide, (episodes, ()), draws, record=lambda after, moved, outcome: outcome.reward)[1]

@@ -10,12 +10,15 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
 from flytune.config.pytree import pytree
+from flytune.kernels.batched import batched
 from flytune.physics import dynamics
 from flytune.simulation import environment
 from flytune.simulation.environment import Episode, Physics
+from flytune.task.observation import draw_noise
 from flytune.task.task import TaskFamily
 
 Memory = Any  # a controller's pytree, the batch along the first axis
@@ -25,10 +28,10 @@ Memory = Any  # a controller's pytree, the batch along the first axis
 class Draw:
     """The random numbers of one step of N episodes."""
 
-    noise: Float[Array, "13 N"]  # standard normal, of the observation
+    noise: Any  # of the observation: standard normal numbers [13, N], or keys [N] that they are drawn with
     keys: Any = None  # [N] of the new episodes; None where none begins
     controller: Any = ()  # what the controller draws, for instance its exploration
-    next_noise: Float[Array, "13 N"] | None = None  # of the observation after the step, before any new episode
+    next_noise: Any = None  # likewise, of the observation after the step, before any new episode
 
 
 class Step(NamedTuple):
@@ -56,7 +59,6 @@ def rollout(
     fresh_memory: Memory = None,
     slack: Any = None,
     physics: Physics = dynamics.step,
-    rematerialise: bool = False,
 ) -> tuple[tuple[Episode, Memory], Step]:
     """Episodes and memory after all steps, and the results of each step.
 
@@ -73,36 +75,62 @@ def rollout(
         fresh_memory: the memory of new episodes, batched like the memory; None keeps the memory through an ending.
         slack: share of a bound by which a margin may be overdrawn before the episode ends; None for none.
         physics: the simulator's step.
-        rematerialise: keep only the episodes between steps for a gradient, and compute each step again.
     """
 
-    def look(episode: Episode, noise: Float[Array, "13"]) -> Float[Array, "17"]:
-        return environment.observe(family.member(episode.numbers), episode, noise)
+    episodes, memory = start
+    restore = ravel_pytree(jax.tree.map(lambda leaf: leaf[..., 0], episodes))[1]
 
-    def advance_one(episode: Episode, action: Float[Array, "4"], key: Any) -> Any:
+    def look(family: TaskFamily, numbers: Float[Array, "K"], noise: Any) -> Float[Array, "17"]:
+        episode = restore(numbers)
+        return environment.observe(family.member(episode.numbers), episode, _normal(noise))
+
+    def move(family: TaskFamily, numbers: Float[Array, "K"], action: Float[Array, "4"], key: Any, noise: Any) -> Any:
+        episode = restore(numbers)
         task = family.member(episode.numbers)
         moved, outcome = environment.step(task, episode, action, physics)
         if slack is not None:
             outcome = environment.with_slack(task, moved, outcome, slack)
         after, over = ending(family, episode, moved, outcome, key)
-        return after, moved, over, record(after, moved, outcome)
+        following = None if noise is None else environment.observe(task, moved, _normal(noise))
+        return ravel_pytree(after)[0], over, following, record(after, moved, outcome)
 
-    see = jax.vmap(look, in_axes=-1, out_axes=0)
-    step = jax.vmap(advance_one, in_axes=(-1, -1, 0), out_axes=-1)
-    if rematerialise:
-        see, step = (jax.checkpoint(function, prevent_cse=False) for function in (see, step))
+    def move_packed(*given: Any) -> Any:
+        numbers, over, following, kept = move(*given)
+        return numbers, over, following, ravel_pytree(kept)[0]
 
-    def advance(carry: tuple[Episode, Memory], given: Any) -> Any:
-        episodes, memory = carry
+    see, step = batched(look, family), batched(move_packed, family)
+
+    def advance(carry: tuple[Array, Memory], given: Any) -> Any:
+        numbers, memory = carry
         now = draw(given)
-        memory, action, notes = decide(memory, see(episodes, now.noise), now.controller, episodes)
-        episodes, moved, over, recorded = step(episodes, action.T, now.keys)
-        following = None if now.next_noise is None else see(moved, now.next_noise)
+        seen = see(numbers, now.noise).T
+        memory, action, notes = decide(memory, seen, now.controller, unpack(numbers))
+        numbers, over, following, kept = step(numbers, action.T, now.keys, now.next_noise)
+        following = None if following is None else following.T
         if fresh_memory is not None:
             memory = jax.tree.map(partial(_where, over), fresh_memory, memory)
-        return (episodes, memory), Step(notes, following, recorded)
+        return (numbers, memory), Step(notes, following, kept)
 
-    return jax.lax.scan(advance, start, inputs)
+    pack = jax.vmap(lambda episode: ravel_pytree(episode)[0], in_axes=-1, out_axes=-1)
+    unpack = jax.vmap(restore, in_axes=-1, out_axes=-1)
+    kept = jax.eval_shape(lambda: _kept_of_one(move, family, episodes, inputs, draw))
+    restore_kept = ravel_pytree(jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), kept))[1]
+    (numbers, memory), steps = jax.lax.scan(advance, (pack(episodes), memory), inputs)
+    record_of_all = jax.vmap(jax.vmap(restore_kept, in_axes=-1, out_axes=-1))(steps.record)
+    return (unpack(numbers), memory), steps._replace(record=record_of_all)
+
+
+def _kept_of_one(move: Callable[..., Any], family: TaskFamily, episodes: Episode, inputs: Any, draw: Any) -> Any:
+    """What is recorded of the first episode at the first step."""
+    first = draw(jax.tree.map(lambda leaf: leaf[0], inputs))
+    numbers = ravel_pytree(jax.tree.map(lambda leaf: leaf[..., 0], episodes))[0]
+    key, noise = jax.tree.map(lambda leaf: leaf[..., 0], (first.keys, first.next_noise))
+    return move(family, numbers, jnp.zeros(4), key, noise)[3]
+
+
+def _normal(noise: Any) -> Float[Array, "13"]:
+    """The normal numbers of an observation, drawn where a key is given."""
+    return draw_noise(noise) if jnp.issubdtype(noise.dtype, jax.dtypes.prng_key) else noise
 
 
 def _where(over: Array, new: Array, old: Array) -> Array:

@@ -18,7 +18,7 @@ from flytune.config.pytree import pytree
 from flytune.control.policy import Network, Policy, make_network
 from flytune.simulation.environment import Episode, Outcome
 from flytune.simulation.rollout import Draw, reset_all, rollout
-from flytune.task.observation import NOISY, SIZE, input_scale
+from flytune.task.observation import SIZE, input_scale
 from flytune.task.task import Task
 from flytune.task.training_settings import ApgSettings
 from flytune.training.update import averaged, descend, rollout_metrics
@@ -93,11 +93,9 @@ def warm_start(settings: ApgSettings, train_state: TrainState, policy: Policy) -
 def update(task: Task, settings: ApgSettings, train_state: TrainState) -> tuple[TrainState, dict[str, Any]]:
     """The training state after one update, and its metrics."""
     key, flight_key = jax.random.split(train_state.key)
-    (_, (episodes, seen)), gradient = jax.value_and_grad(_loss, argnums=2, has_aux=True)(
-        task, settings, train_state.actor, train_state.episodes, flight_key
-    )
-    actor, optimiser = descend(_optimiser(settings), gradient, train_state.optimiser, train_state.actor)
-    seen["gradient_norm"] = optax.tree.norm(gradient)
+    slope, episodes, seen = gradient(task, settings, train_state.actor, train_state.episodes, flight_key)
+    actor, optimiser = descend(_optimiser(settings), slope, train_state.optimiser, train_state.actor)
+    seen["gradient_norm"] = optax.tree.norm(slope)
     after = TrainState(
         actor=actor,
         ema=averaged(train_state.ema, actor, settings.ema_decay, train_state.updates),
@@ -109,26 +107,66 @@ def update(task: Task, settings: ApgSettings, train_state: TrainState) -> tuple[
     return after, seen
 
 
-def _loss(task: Task, settings: ApgSettings, actor: Network, episodes: Episode, key: Array) -> Any:
-    """Mean cost per step of the whole batch, and the episodes it ends with."""
+def gradient(
+    task: Task, settings: ApgSettings, actor: Network, episodes: Episode, key: Array
+) -> tuple[Network, Episode, dict[str, Any]]:
+    """The gradient of the mean cost per step of the whole batch, the episodes after the window, and the metrics.
+
+    The gradient of a layer's weights is a sum over all steps and episodes of (inputs of the layer) x (gradient of its
+    sums). So only the gradients of the sums go back through time, and one product per layer follows. What is added to
+    the sums for this purpose is zero.
+
+    Args:
+        task: what is trained.
+        settings: of the training.
+        actor: the network.
+        episodes: N episodes.
+        key: of noise and new episodes.
+    """
+    rows = settings.window * settings.environments
+    nothing = [jnp.zeros((settings.window, settings.environments, bias.size)) for bias in actor.biases]
+    (_, (episodes, metrics, inputs)), slopes = jax.value_and_grad(cost, argnums=5, has_aux=True)(
+        task, settings, actor, episodes, key, nothing
+    )
+    slopes = [slope.reshape(rows, -1) for slope in slopes]
+    weights = tuple(each.reshape(rows, -1).T @ slope for each, slope in zip(inputs, slopes, strict=True))
+    return Network(weights=weights, biases=tuple(jnp.sum(slope, axis=0) for slope in slopes)), episodes, metrics
+
+
+def cost(
+    task: Task, settings: ApgSettings, actor: Network, episodes: Episode, key: Array, added: Any = None
+) -> tuple[Array, tuple[Episode, dict[str, Any], Any]]:
+    """Mean cost per step of the whole batch; the episodes after it, the metrics, and the inputs of each layer.
+
+    Args:
+        task: what is trained.
+        settings: of the training.
+        actor: the network.
+        episodes: N episodes.
+        key: of noise and new episodes.
+        added: what is added to the sums of each layer, [T, N, outputs] each; nothing where None.
+    """
     task = dataclasses.replace(task, initial_state=settings.initial_state)
     scale = input_scale(settings.input_scale)
     noise_key, reset_key = jax.random.split(key)
     draws = Draw(
-        noise=jax.random.normal(noise_key, (settings.window, NOISY, settings.environments)),
+        noise=jax.random.split(noise_key, (settings.window, settings.environments)),
         keys=jax.random.split(reset_key, (settings.window, settings.environments)),
+        controller=[jnp.zeros((settings.window, 1, 1))] * len(actor.biases) if added is None else added,
     )
 
     def decide(memory: Any, observation: Array, draw: Any, episodes: Episode) -> Any:
-        return memory, jnp.tanh(actor(observation * scale)), ()
+        layer, inputs = observation * scale, []
+        for weight, bias, more in zip(actor.weights, actor.biases, draw, strict=True):
+            inputs.append(layer)
+            layer = jnp.tanh(layer @ weight + bias + more)
+        return memory, layer, inputs
 
     def record(after: Episode, moved: Episode, outcome: Outcome) -> Any:
-        cost = sum((barrier(margin, settings) for margin in outcome.margins.values()), start=jnp.zeros(()))
-        return outcome.reward - cost, outcome, moved
+        price = sum((barrier(margin, settings) for margin in outcome.margins.values()), start=jnp.zeros(()))
+        return outcome.reward - price, outcome, moved
 
-    (episodes, _), step = rollout(
-        task, decide, (episodes, ()), draws, record=record, slack=settings.termination_slack, rematerialise=True
-    )
+    (episodes, _), step = rollout(task, decide, (episodes, ()), draws, record=record, slack=settings.termination_slack)
     worth, outcome, moved = step.record
     metrics = rollout_metrics(task, outcome, moved.reward, moved.steps)
-    return -jnp.mean(worth), (episodes, {**metrics, "objective": jnp.mean(worth)})
+    return -jnp.mean(worth), (episodes, {**metrics, "objective": jnp.mean(worth)}, step.notes)

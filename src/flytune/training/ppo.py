@@ -22,7 +22,7 @@ from flytune.control.policy import Network, Policy, make_network
 from flytune.simulation.environment import Episode
 from flytune.simulation.rollout import Draw, reset_all
 from flytune.simulation.rollout import rollout as simulate
-from flytune.task.observation import NOISY, SIZE, input_scale
+from flytune.task.observation import SIZE, input_scale
 from flytune.task.task import Task
 from flytune.task.training_settings import PpoSettings
 from flytune.training.update import averaged, descend, rollout_metrics
@@ -116,7 +116,7 @@ def rollout(
     """The episodes after `settings.rollout` steps, the samples [time, environment, ...], and their metrics."""
     noise_key, action_key, reset_key = jax.random.split(key, 3)
     steps, width = settings.rollout, settings.environments
-    noise = jax.random.normal(noise_key, (steps + 1, NOISY, width))
+    noise = jax.random.split(noise_key, (steps + 1, width))
     draws = Draw(
         noise=noise[:-1],
         keys=jax.random.split(reset_key, (steps, width)),

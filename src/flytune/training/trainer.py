@@ -76,6 +76,9 @@ class Trainer:
 
     def start(self, task: Task, key: Array) -> Any:
         """The training state before the first update."""
+        from flytune.training.update import keep_freed_memory
+
+        keep_freed_memory()
         return self._algorithm().start(task, self.settings(task), key)
 
     def update(self, task: Task, train_state: Any) -> tuple[Any, dict[str, Any]]:

@@ -1,6 +1,8 @@
 """The parts of an update that trainers share: the optimiser step, the average of the weights, and the metrics."""
 
+import ctypes
 import math
+import sys
 from typing import Any, TypeVar
 
 import jax
@@ -16,6 +18,23 @@ from flytune.task.task import Task
 from flytune.task.termination import causes
 
 T = TypeVar("T")
+
+# parameters of glibc's mallopt: the size from which a block is mapped by itself, the free memory that is given back,
+# and the number of arenas; all but the first arena map blocks of 64 MB and more by themselves
+MMAP_THRESHOLD, TRIM_THRESHOLD, ARENA_MAX = -3, -1, -8
+
+
+def keep_freed_memory() -> None:
+    """Let this process keep the memory that it frees, where the C library is glibc.
+
+    An update allocates and frees tens of megabytes. Otherwise the operating system takes the memory back each time, and
+    clears every page before it gives it out again: half of the time of an update.
+    """
+    mallopt = getattr(ctypes.CDLL(None), "mallopt", None) if sys.platform == "linux" else None
+    if mallopt is not None:
+        mallopt(MMAP_THRESHOLD, 2**30)
+        mallopt(TRIM_THRESHOLD, 2**31 - 1)
+        mallopt(ARENA_MAX, 1)
 
 
 def descend(optimiser: optax.GradientTransformation, gradient: T, memory: Any, parameters: T) -> tuple[T, Any]:
