@@ -21,15 +21,10 @@ def train_state(small_task):
 
 
 def test_the_gradient_agrees_with_finite_differences_of_the_flown_reward(small_task, train_state):
-    given = (train_state.episodes, jax.random.key(1))
-
     def cost(actor):
-        return apg.cost(small_task, small_task.apg, actor, *given)[0]
+        return apg._loss(small_task, small_task.apg, actor, train_state.episodes, jax.random.key(1))[0]
 
-    value, expected = jax.jit(jax.value_and_grad(cost))(train_state.actor)
-    gradient = jax.jit(lambda actor: apg.gradient(small_task, small_task.apg, actor, *given)[0])(train_state.actor)
-    for one, other in zip(jax.tree.leaves(gradient), jax.tree.leaves(expected), strict=True):
-        np.testing.assert_allclose(one, other, rtol=1e-3, atol=1e-5 * float(jnp.max(jnp.abs(other))))
+    value, gradient = jax.jit(jax.value_and_grad(cost))(train_state.actor)
     jitted = jax.jit(cost)
     assert np.isfinite(value)
     # along the gradient itself the directional derivative is its squared norm

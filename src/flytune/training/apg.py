@@ -93,9 +93,11 @@ def warm_start(settings: ApgSettings, train_state: TrainState, policy: Policy) -
 def update(task: Task, settings: ApgSettings, train_state: TrainState) -> tuple[TrainState, dict[str, Any]]:
     """The training state after one update, and its metrics."""
     key, flight_key = jax.random.split(train_state.key)
-    slope, episodes, seen = gradient(task, settings, train_state.actor, train_state.episodes, flight_key)
-    actor, optimiser = descend(_optimiser(settings), slope, train_state.optimiser, train_state.actor)
-    seen["gradient_norm"] = optax.tree.norm(slope)
+    (_, (episodes, seen)), gradient = jax.value_and_grad(_loss, argnums=2, has_aux=True)(
+        task, settings, train_state.actor, train_state.episodes, flight_key
+    )
+    actor, optimiser = descend(_optimiser(settings), gradient, train_state.optimiser, train_state.actor)
+    seen["gradient_norm"] = optax.tree.norm(gradient)
     after = TrainState(
         actor=actor,
         ema=averaged(train_state.ema, actor, settings.ema_decay, train_state.updates),
@@ -107,66 +109,24 @@ def update(task: Task, settings: ApgSettings, train_state: TrainState) -> tuple[
     return after, seen
 
 
-def gradient(
-    task: Task, settings: ApgSettings, actor: Network, episodes: Episode, key: Array
-) -> tuple[Network, Episode, dict[str, Any]]:
-    """The gradient of the mean cost per step of the whole batch, the episodes after the window, and the metrics.
-
-    The gradient of a layer's weights is a sum over all steps and episodes of (inputs of the layer) x (gradient of its
-    sums). So only the gradients of the sums go back through time, and one product per layer follows. What is added to
-    the sums for this purpose is zero.
-
-    Args:
-        task: what is trained.
-        settings: of the training.
-        actor: the network.
-        episodes: N episodes.
-        key: of noise and new episodes.
-    """
-    rows = settings.window * settings.environments
-    nothing = [jnp.zeros((settings.window, settings.environments, bias.size)) for bias in actor.biases]
-    (_, (episodes, metrics, inputs)), slopes = jax.value_and_grad(cost, argnums=5, has_aux=True)(
-        task, settings, actor, episodes, key, nothing
-    )
-    slopes = [slope.reshape(rows, -1) for slope in slopes]
-    weights = tuple(each.reshape(rows, -1).T @ slope for each, slope in zip(inputs, slopes, strict=True))
-    return Network(weights=weights, biases=tuple(jnp.sum(slope, axis=0) for slope in slopes)), episodes, metrics
-
-
-def cost(
-    task: Task, settings: ApgSettings, actor: Network, episodes: Episode, key: Array, added: Any = None
-) -> tuple[Array, tuple[Episode, dict[str, Any], Any]]:
-    """Mean cost per step of the whole batch; the episodes after it, the metrics, and the inputs of each layer.
-
-    Args:
-        task: what is trained.
-        settings: of the training.
-        actor: the network.
-        episodes: N episodes.
-        key: of noise and new episodes.
-        added: what is added to the sums of each layer, [T, N, outputs] each; nothing where None.
-    """
+def _loss(task: Task, settings: ApgSettings, actor: Network, episodes: Episode, key: Array) -> Any:
+    """Mean cost per step of the whole batch, and the episodes it ends with."""
     task = dataclasses.replace(task, initial_state=settings.initial_state)
     scale = input_scale(settings.input_scale)
     noise_key, reset_key = jax.random.split(key)
     draws = Draw(
         noise=jax.random.split(noise_key, (settings.window, settings.environments)),
         keys=jax.random.split(reset_key, (settings.window, settings.environments)),
-        controller=[jnp.zeros((settings.window, 1, 1))] * len(actor.biases) if added is None else added,
     )
 
     def decide(memory: Any, observation: Array, draw: Any, episodes: Episode) -> Any:
-        layer, inputs = observation * scale, []
-        for weight, bias, more in zip(actor.weights, actor.biases, draw, strict=True):
-            inputs.append(layer)
-            layer = jnp.tanh(layer @ weight + bias + more)
-        return memory, layer, inputs
+        return memory, jnp.tanh(actor(observation * scale)), ()
 
     def record(after: Episode, moved: Episode, outcome: Outcome) -> Any:
-        price = sum((barrier(margin, settings) for margin in outcome.margins.values()), start=jnp.zeros(()))
-        return outcome.reward - price, outcome, moved
+        cost = sum((barrier(margin, settings) for margin in outcome.margins.values()), start=jnp.zeros(()))
+        return outcome.reward - cost, outcome, moved
 
     (episodes, _), step = rollout(task, decide, (episodes, ()), draws, record=record, slack=settings.termination_slack)
     worth, outcome, moved = step.record
     metrics = rollout_metrics(task, outcome, moved.reward, moved.steps)
-    return -jnp.mean(worth), (episodes, {**metrics, "objective": jnp.mean(worth)}, step.notes)
+    return -jnp.mean(worth), (episodes, {**metrics, "objective": jnp.mean(worth)})
