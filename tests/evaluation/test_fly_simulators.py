@@ -120,8 +120,8 @@ def test_flown_step_by_step_or_at_once_is_the_same(task, own):
     both = (own[0], Echo(gain=jnp.float32(0.05)), 0.6), (own[1], Diver(), 2.0)
     for at_once, controller, duration in both:
         stepped = fly(controller, task, trials=at_once.trials, duration=duration, simulator=StepByStep)
-        for name in FIELDS:
-            np.testing.assert_allclose(getattr(stepped, name), getattr(at_once, name), atol=2e-5, rtol=1e-6)
+        for name in FIELDS:  # two programs round differently, and a vehicle that tumbles makes that grow
+            np.testing.assert_allclose(getattr(stepped, name), getattr(at_once, name), atol=1e-4, rtol=1e-5, err_msg=name)
         for name, margin in at_once.margins.items():
             # a margin of altitude is a height in tenths of a metre
             np.testing.assert_allclose(stepped.margins[name], margin, atol=2e-4, err_msg=name)

@@ -16,6 +16,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
+from flytune.kernels.batched import batched
 from flytune.physics.dynamics import hovering
 from flytune.simulation import environment
 from flytune.simulation.environment import Episode
@@ -208,7 +209,7 @@ def unravel(task: Task, numbers: Array) -> Episode:
 
 
 def _seen(task: Task, episodes: Episode, noise: Any) -> Float[Array, "17 N"]:
-    return jax.vmap(partial(environment.observe, task), in_axes=-1, out_axes=-1)(episodes, noise)
+    return batched(environment.observe, task)(episodes, noise)
 
 
 @partial(jax.jit, static_argnums=(0, 1))
@@ -252,7 +253,7 @@ def _step(
         noise = jax.random.normal(noise_key, (NOISY, number)) if noise is None else noise
         keys = jax.random.split(start_key, number) if ending == "restart" else None
 
-    def one(episode: Episode, action: Array, elsewhere: Any, key: Any) -> Any:
+    def one(task: Task, episode: Episode, action: Array, elsewhere: Any, key: Any) -> Any:
         if elsewhere is None:
             moved, outcome = environment.step(task, episode, action, physics)
         else:  # pending actions stay in the simulator
@@ -260,8 +261,7 @@ def _step(
             moved, outcome = environment.assess(task, episode, state, jnp.clip(action, -1.0, 1.0))
         return *ENDINGS[ending](task, episode, moved, outcome, key), moved, outcome
 
-    axes = (-1, -1, None if reached is None else -1, 0)
-    after, over, moved, outcome = jax.vmap(one, in_axes=axes, out_axes=-1)(before, action.T, reached, keys)
+    after, over, moved, outcome = batched(one, task)(before, action.T, reached, keys)
     seen = _seen(task, after, noise)
     final = _seen(task, moved, noise) if ending == "restart" else seen
     states = placed = state_numbers(after.state)
