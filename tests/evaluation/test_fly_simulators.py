@@ -121,7 +121,9 @@ def test_flown_step_by_step_or_at_once_is_the_same(task, own):
     for at_once, controller, duration in both:
         stepped = fly(controller, task, trials=at_once.trials, duration=duration, simulator=StepByStep)
         for name in FIELDS:  # two programs round differently, and a vehicle that tumbles makes that grow
-            np.testing.assert_allclose(getattr(stepped, name), getattr(at_once, name), atol=1e-4, rtol=1e-5, err_msg=name)
+            np.testing.assert_allclose(
+                getattr(stepped, name), getattr(at_once, name), atol=1e-4, rtol=1e-5, err_msg=name
+            )
         for name, margin in at_once.margins.items():
             # a margin of altitude is a height in tenths of a metre
             np.testing.assert_allclose(stepped.margins[name], margin, atol=2e-4, err_msg=name)

@@ -7,7 +7,6 @@ import jax.numpy as jnp
 import numpy as np
 from annotated_types import Gt, Le, Unit
 from jaxtyping import Array, Float
-from scipy.linalg import solve_discrete_are
 
 from flytune.config.document import Real
 from flytune.config.pytree import pytree
@@ -107,6 +106,8 @@ def feedback(vehicle: Vehicle, gains: LqrGains) -> Float[np.ndarray, "4 16"]:
     a, b = linearised(vehicle)
     q, r = weights(gains)
     try:
+        from scipy.linalg import solve_discrete_are  # late, because it is slow to import
+
         p = solve_discrete_are(a, b, q, r)
     except np.linalg.LinAlgError as error:
         raise BadInput(f"lqr: no feedback for these weights ({error}). Bring them nearer to the textbook's.") from None

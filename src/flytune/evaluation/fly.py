@@ -12,6 +12,7 @@ import numpy as np
 from flytune.control.controller import Controller
 from flytune.errors import BadInput, Diverged
 from flytune.evaluation.flights import Flights
+from flytune.kernels.programs import program
 from flytune.physics.dynamics import CONTROL_PERIOD
 from flytune.physics.vehicle import Vehicle
 from flytune.runs.find import FoundController
@@ -186,10 +187,15 @@ def _rollout_on_host(
 
 def trial_keys(seed: int, trials: int) -> jax.Array:
     """The random key of each trial, from the seed and the trial's number alone."""
+    return _trial_keys(np.uint32(seed), trials)
+
+
+@program(static=["trials"])
+def _trial_keys(seed: jax.Array, trials: int) -> jax.Array:
     return jax.vmap(partial(jax.random.fold_in, jax.random.key(seed)))(jnp.arange(trials))
 
 
-@jax.jit
+@program()
 def _begin(task: Task, initial_state: InitialState, keys: jax.Array) -> tuple[jax.Array, jax.Array]:
     """The states [17, N] in which trials begin, and the keys of their noise."""
 
@@ -200,7 +206,7 @@ def _begin(task: Task, initial_state: InitialState, keys: jax.Array) -> tuple[ja
     return jax.vmap(one, out_axes=(-1, 0))(keys)
 
 
-@jax.jit
+@program()
 def _episodes(task: Task, starts: jax.Array) -> jax.Array:
     """The episodes [K, N] that begin in states [17, N]; one that begins crashed is held from the start."""
     return ravel(_started(task, starts))
@@ -216,7 +222,7 @@ def _started(task: Task, starts: jax.Array) -> Episode:
     return jax.vmap(one, in_axes=-1, out_axes=-1)(starts)
 
 
-@partial(jax.jit, static_argnums=(0, 5))
+@program(static=["physics", "steps"])
 def _rollout_on_device(
     physics: Any, controller: Any, task: Task, starts: jax.Array, noise_keys: jax.Array, steps: int
 ) -> tuple[Record, jax.Array, jax.Array]:
@@ -242,7 +248,7 @@ def _rollout_on_device(
     return Record(states, actions, episodes.steps < 0), *step.notes
 
 
-@jax.jit
+@program()
 def _noise(keys: jax.Array, index: Any) -> jax.Array:
     """The noise [13, N] of every trial's observation at sample `index`."""
     return jax.vmap(lambda key: draw_noise(jax.random.fold_in(key, index)), out_axes=-1)(keys)
@@ -252,7 +258,7 @@ def _initial_memory(controller: Any, trials: int) -> Any:
     return jax.tree.map(lambda part: jnp.broadcast_to(part, (trials, *jnp.shape(part))), controller.initial_memory())
 
 
-@jax.jit
+@program()
 def _decide(controller: Any, memory: Any, seen: jax.Array) -> tuple[Any, jax.Array, jax.Array, jax.Array]:
     """The controller's memory, actions clipped [N, 4], actions as given, and which of them are finite [N].
 
@@ -263,7 +269,7 @@ def _decide(controller: Any, memory: Any, seen: jax.Array) -> tuple[Any, jax.Arr
     return memory, jnp.clip(given, -1.0, 1.0), given, finite
 
 
-@jax.jit
+@program()
 def _margins(task: Task, states: jax.Array, actions: jax.Array) -> dict[str, jax.Array]:
     """The margins [N, T + 1] of states [T + 1, 17, N] under actions [T + 1, 4, N]."""
 

@@ -8,7 +8,7 @@ import contextlib
 import ctypes
 import functools
 import hashlib
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +27,13 @@ DECLARATIONS = "\n".join(
     [f"declare float @llvm.{name}.f32(float)" for name in ("sqrt", "fabs", "floor")]
     + [f"declare float @llvm.{name}.f32(float, float)" for name in ("maximum", "minimum")]
     + [f"declare i32 @llvm.{name}.sat.i32.f32(float)" for name in ("fptosi", "fptoui")]
+)
+
+LOOP_METADATA = (
+    "!0 = distinct !{!0, !1, !2, !3}",
+    '!1 = !{!"llvm.loop.vectorize.enable", i1 true}',
+    f'!2 = !{{!"llvm.loop.vectorize.width", i32 {WIDTH}}}',
+    '!3 = !{!"llvm.loop.interleave.count", i32 1}',
 )
 
 
@@ -69,13 +76,10 @@ def module(jaxpr: Any, batched: Sequence[bool], number: int) -> tuple[str, str]:
             "end:",
             "  ret void",
             "}",
-            "!0 = distinct !{!0, !1, !2, !3}",
-            '!1 = !{!"llvm.loop.vectorize.enable", i1 true}',
-            f'!2 = !{{!"llvm.loop.vectorize.width", i32 {WIDTH}}}',
-            '!3 = !{!"llvm.loop.interleave.count", i32 1}',
+            *LOOP_METADATA,
         ]
     )
-    text = "\n".join([DECLARATIONS, body, _handler(buffers)])
+    text = "\n".join([DECLARATIONS, body, handler(buffers)])
     name = f"flytune_{hashlib.sha256(text.encode()).hexdigest()[:24]}"
     return name, text.replace("NAME", name)
 
@@ -110,7 +114,7 @@ def _stores(buffer: str, values: Values, kind: Any, number: int) -> list[str]:
     return lines
 
 
-def _handler(buffers: Sequence[str]) -> str:
+def handler(buffers: Sequence[str]) -> str:
     """What XLA calls: it answers what version it is of, or takes the addresses of the buffers and runs the loop."""
     counts = {"in": ARGUMENTS, "out": RESULTS}
     lines = []
@@ -153,6 +157,15 @@ def _handler(buffers: Sequence[str]) -> str:
 
 
 @functools.cache
+def vector_width() -> int:
+    """Numbers in a vector register of this processor, in single precision."""
+    from llvmlite import binding
+
+    features = binding.get_host_cpu_features()
+    return 16 if features.get("avx512f") else 8 if features.get("avx") else 4
+
+
+@functools.cache
 def _machine() -> Any:
     """LLVM's description of this processor."""
     from llvmlite import binding
@@ -168,6 +181,18 @@ def _machine() -> Any:
 
 
 _engines: dict[str, Any] = {}  # the machine code of each registered kernel, kept for as long as the process lives
+_recorders: list[set[str]] = []
+
+
+@contextlib.contextmanager
+def recorded() -> Iterator[set[str]]:
+    """The names of the kernels that are registered, or are registered already and asked for again, meanwhile."""
+    names: set[str] = set()
+    _recorders.append(names)
+    try:
+        yield names
+    finally:
+        _recorders.remove(names)
 
 
 def register(name: str, text: str) -> None:
@@ -175,14 +200,29 @@ def register(name: str, text: str) -> None:
 
     The code is kept beside XLA's compiled programs, where JAX has a folder for them (`jax_compilation_cache_dir`).
     """
-    if name in _engines:
-        return
+    for names in _recorders:
+        names.add(name)
+    if not load(name):
+        code = _compile(text)
+        place = _place(name)
+        if place is not None:
+            keep(place, code)
+        _register(name, code)
+
+
+def load(name: str) -> bool:
+    """Whether a kernel is registered, after an attempt with the code that an earlier process kept."""
+    if name not in _engines:
+        place = _place(name)
+        code = None if place is None else kept(place)
+        if code is not None:
+            _register(name, code)
+    return name in _engines
+
+
+def _register(name: str, code: bytes) -> None:
     from llvmlite import binding
 
-    code = _cached(name)
-    if code is None:
-        code = _compile(text)
-        _keep(name, code)
     engine = binding.create_mcjit_compiler(binding.parse_assembly(""), _machine())
     engine.add_object_file(binding.ObjectFileRef.from_data(code))
     engine.finalize_object()
@@ -205,29 +245,35 @@ def _compile(text: str) -> bytes:
     return _machine().emit_object(parsed)
 
 
-def _place(name: str) -> Path | None:
-    """Where the code of a kernel is kept; another processor or another version of LLVM has another file."""
+@functools.cache
+def processor() -> str:
+    """This processor and the version of LLVM: what machine code is made for."""
     from llvmlite import binding
 
+    return f"{binding.get_host_cpu_name()} {binding.get_host_cpu_features().flatten()} {binding.llvm_version_info}"
+
+
+def _place(name: str) -> Path | None:
+    """Where the code of a kernel is kept; another processor or another version of LLVM has another file."""
+    folder = cache_folder()
+    return None if folder is None else folder / f"{name}-{hashlib.sha256(processor().encode()).hexdigest()[:12]}.o"
+
+
+def cache_folder() -> Path | None:
+    """Where JAX keeps compiled programs, None where it keeps none."""
     folder: str | None = jax.config.jax_compilation_cache_dir  # pyright: ignore[reportAttributeAccessIssue]
-    if folder is None:
-        return None
-    facts = f"{binding.get_host_cpu_name()} {binding.get_host_cpu_features().flatten()} {binding.llvm_version_info}"
-    return Path(folder) / f"{name}-{hashlib.sha256(facts.encode()).hexdigest()[:12]}.o"
+    return None if folder is None else Path(folder)
 
 
-def _cached(name: str) -> bytes | None:
-    """The code that was kept, None where there is none or its file is damaged."""
-    place = _place(name)
-    content = place.read_bytes() if place is not None and place.is_file() else b""
-    digest, code = content[:32], content[32:]
-    return code if code and hashlib.sha256(code).digest() == digest else None
+def kept(place: Path) -> bytes | None:
+    """The content of a file that `keep` wrote, None where there is none or it is damaged."""
+    content = place.read_bytes() if place.is_file() else b""
+    digest, content = content[:32], content[32:]
+    return content if content and hashlib.sha256(content).digest() == digest else None
 
 
-def _keep(name: str, code: bytes) -> None:
-    """Write the code behind its digest; a folder that cannot be written only costs time."""
-    place = _place(name)
-    if place is not None:
-        with contextlib.suppress(OSError, BadInput):
-            place.parent.mkdir(parents=True, exist_ok=True)
-            write_bytes(place, hashlib.sha256(code).digest() + code)
+def keep(place: Path, content: bytes) -> None:
+    """Write a file, with a digest before its content; a folder that cannot be written only costs time."""
+    with contextlib.suppress(OSError, BadInput):
+        place.parent.mkdir(parents=True, exist_ok=True)
+        write_bytes(place, hashlib.sha256(content).digest() + content)

@@ -10,6 +10,7 @@ from annotated_types import Ge, Le, Unit
 
 from flytune.config.document import Whole
 from flytune.config.pytree import pytree, static
+from flytune.kernels.programs import program
 from flytune.physics import dynamics
 from flytune.physics.dynamics import PHYSICS_STEPS, State
 from flytune.physics.vehicle import Vehicle
@@ -32,7 +33,7 @@ class JaxSimulator:
     def __init__(self, vehicle: Vehicle, number: int, options: JaxSimulatorOptions | None = None) -> None:
         self.physics = self._step = _physics((options or JaxSimulatorOptions()).physics_steps)
         self._vehicle = vehicle
-        hovering = np.asarray(state_numbers(dynamics.hovering(vehicle, (0.0, 0.0, 0.0))))
+        hovering = np.asarray(_hovering(vehicle))
         self._numbers = np.repeat(hovering[:, None], number, axis=1)
         self._pending = np.zeros((vehicle.action_latency_steps, 4, number), np.float32)
 
@@ -51,6 +52,12 @@ class JaxSimulator:
 
     def close(self) -> None:
         """Nothing to free."""
+
+
+@program()
+def _hovering(vehicle: Vehicle) -> jax.Array:
+    """The state [17] of a vehicle that hovers at the origin."""
+    return state_numbers(dynamics.hovering(vehicle, (0.0, 0.0, 0.0)))
 
 
 @lru_cache  # the same function for the same number, so that one compiled program serves every simulator

@@ -5,6 +5,7 @@ from typing import Annotated
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from annotated_types import Ge, Unit
 from jaxtyping import Array, Float
 
@@ -62,7 +63,7 @@ def observe(
 
 def input_scale(factors: Sequence[float]) -> Float[Array, "17"]:
     """What each number of the observation is multiplied with for a network, from one factor per block."""
-    return jnp.repeat(jnp.asarray(factors), jnp.asarray(BLOCKS), total_repeat_length=SIZE)
+    return jnp.asarray(np.repeat(np.asarray(factors, np.float32), BLOCKS))
 
 
 def draw_noise(key: jax.Array) -> Float[Array, "13"]:

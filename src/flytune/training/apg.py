@@ -6,7 +6,6 @@ episode has no gradient; so each termination condition also adds a smooth barrie
 """
 
 import dataclasses
-from functools import partial
 from typing import Any
 
 import jax
@@ -16,6 +15,8 @@ from jaxtyping import Array, Float
 
 from flytune.config.pytree import pytree
 from flytune.control.policy import Network, Policy, make_network
+from flytune.kernels.dense import perceptron
+from flytune.kernels.programs import program
 from flytune.simulation.environment import Episode, Outcome
 from flytune.simulation.rollout import Draw, reset_all, rollout
 from flytune.task.observation import SIZE, input_scale
@@ -54,7 +55,7 @@ def _optimiser(settings: ApgSettings) -> optax.GradientTransformation:
     )
 
 
-@partial(jax.jit, static_argnames="settings")
+@program(static=["settings"])
 def start(task: Task, settings: ApgSettings, key: Array) -> TrainState:
     """The training state before the first update."""
     task = dataclasses.replace(task, initial_state=settings.initial_state)
@@ -89,7 +90,7 @@ def warm_start(settings: ApgSettings, train_state: TrainState, policy: Policy) -
     return dataclasses.replace(train_state, actor=actor, ema=jax.tree.map(jnp.array, actor))
 
 
-@partial(jax.jit, static_argnames="settings", donate_argnames="train_state")
+@program(static=["settings"], donate=["train_state"])
 def update(task: Task, settings: ApgSettings, train_state: TrainState) -> tuple[TrainState, dict[str, Any]]:
     """The training state after one update, and its metrics."""
     key, flight_key = jax.random.split(train_state.key)
@@ -112,7 +113,8 @@ def update(task: Task, settings: ApgSettings, train_state: TrainState) -> tuple[
 def _loss(task: Task, settings: ApgSettings, actor: Network, episodes: Episode, key: Array) -> Any:
     """Mean cost per step of the whole batch, and the episodes it ends with."""
     task = dataclasses.replace(task, initial_state=settings.initial_state)
-    scale = input_scale(settings.input_scale)
+    first, *others = actor.weights
+    weights = (first * input_scale(settings.input_scale)[:, None], *others)
     noise_key, reset_key = jax.random.split(key)
     draws = Draw(
         noise=jax.random.split(noise_key, (settings.window, settings.environments)),
@@ -120,7 +122,7 @@ def _loss(task: Task, settings: ApgSettings, actor: Network, episodes: Episode, 
     )
 
     def decide(memory: Any, observation: Array, draw: Any, episodes: Episode) -> Any:
-        return memory, jnp.tanh(actor(observation * scale)), ()
+        return memory, perceptron(weights, actor.biases, observation.T, squash=True).T, ()
 
     def record(after: Episode, moved: Episode, outcome: Outcome) -> Any:
         cost = sum((barrier(margin, settings) for margin in outcome.margins.values()), start=jnp.zeros(()))

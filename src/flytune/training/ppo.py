@@ -8,7 +8,6 @@ One update is one compiled function: a rollout and twelve epochs.
 
 import dataclasses
 import math
-from functools import partial
 from typing import Any
 
 import jax
@@ -19,6 +18,7 @@ from jaxtyping import Array, Float
 
 from flytune.config.pytree import pytree
 from flytune.control.policy import Network, Policy, make_network
+from flytune.kernels.programs import program
 from flytune.simulation.environment import Episode
 from flytune.simulation.rollout import Draw, reset_all
 from flytune.simulation.rollout import rollout as simulate
@@ -70,7 +70,7 @@ def last_policy(settings: PpoSettings, train_state: TrainState) -> Policy:
     return Policy(actor=train_state.parameters.actor, input_scale=input_scale(settings.input_scale), squash="clip")
 
 
-@partial(jax.jit, static_argnames="settings")
+@program(static=["settings"])
 def start(task: Task, settings: PpoSettings, key: Array) -> TrainState:
     """The training state before the first update."""
     actor_key, critic_key, episode_key, key = jax.random.split(key, 4)
@@ -90,7 +90,7 @@ def start(task: Task, settings: PpoSettings, key: Array) -> TrainState:
     )
 
 
-@partial(jax.jit, static_argnames="settings", donate_argnames="train_state")
+@program(static=["settings"], donate=["train_state"])
 def update(task: Task, settings: PpoSettings, train_state: TrainState) -> tuple[TrainState, dict[str, Any]]:
     """The training state after one update, and its metrics."""
     key, rollout_key, shuffle_key = jax.random.split(train_state.key, 3)

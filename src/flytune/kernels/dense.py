@@ -1,0 +1,356 @@
+"""A multilayer perceptron and its gradient as two kernels; all layers, biases and activations of a batch in one call.
+
+XLA computes each product, bias, activation, transposition and sum of a small network by a call of its own, which takes
+as long as the arithmetic. Here the batch is the last axis, so that the arithmetic runs along contiguous memory.
+"""
+
+import functools
+import hashlib
+import itertools
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from flytune.kernels import elementary
+from flytune.kernels.batched import available
+from flytune.kernels.emit import Emitter
+from flytune.kernels.native import LOOP_METADATA, handler, register, vector_width
+
+ROWS = 6  # of a tile of a product; with two vectors of columns it fills the registers of AVX2
+
+Layers = tuple[tuple[Array, ...], tuple[Array, ...]]  # weights [inputs, outputs] and biases [outputs]
+
+
+def perceptron(
+    weights: Sequence[Float[Array, "_ _"]],
+    biases: Sequence[Float[Array, "_"]],
+    inputs: Float[Array, "inputs N"],
+    *,
+    squash: bool = False,
+) -> Float[Array, "outputs N"]:
+    """The outputs of a multilayer perceptron with tanh between its layers, for a batch along the last axis.
+
+    Args:
+        weights: of each layer, [inputs, outputs].
+        biases: of each layer.
+        inputs: of the first layer.
+        squash: whether tanh also follows the last layer.
+    """
+    if not available():
+        return plain(weights, biases, inputs, squash=squash)
+    return _perceptron(squash, (tuple(weights), tuple(biases)), inputs)
+
+
+def plain(weights: Sequence[Any], biases: Sequence[Any], inputs: Any, *, squash: bool = False) -> Any:
+    """The same in JAX."""
+    for weight, bias in zip(weights[:-1], biases[:-1], strict=True):
+        inputs = jnp.tanh(weight.T @ inputs + bias[:, None])
+    outputs = weights[-1].T @ inputs + biases[-1][:, None]
+    return jnp.tanh(outputs) if squash else outputs
+
+
+@functools.partial(jax.custom_vjp, nondiff_argnums=(0,))
+def _perceptron(squash: bool, layers: Layers, inputs: Array) -> Array:
+    return _forward(squash, layers, inputs)[0]
+
+
+def _forward(squash: bool, layers: Layers, inputs: Array) -> tuple[Array, Any]:
+    sizes, number = _sizes(layers), inputs.shape[-1]
+    results = _call(_forward_text(sizes, number, squash), [*itertools.chain(*layers), inputs],
+                    [(size, number) for size in sizes[1:]])  # fmt: skip
+    return results[-1], (layers, inputs, results)
+
+
+def _backward(squash: bool, kept: Any, cotangent: Array) -> tuple[Layers, Array]:
+    layers, inputs, activations = kept
+    sizes, number = _sizes(layers), inputs.shape[-1]
+    widest, count = max(sizes), len(layers[0])
+    shapes = [each.shape for each in itertools.chain(*layers)] + [inputs.shape] + [(widest, number)] * 3
+    text = _backward_text(sizes, number, squash)
+    results = _call(text, [*layers[0], inputs, *activations, cotangent], shapes)
+    return (tuple(results[:count]), tuple(results[count : 2 * count])), results[2 * count]
+
+
+_perceptron.defvjp(_forward, _backward)
+
+
+def _sizes(layers: Layers) -> tuple[int, ...]:
+    return (layers[0][0].shape[0], *(weight.shape[1] for weight in layers[0]))
+
+
+def _call(text: tuple[str, str], inputs: Sequence[Array], shapes: Sequence[tuple[int, ...]]) -> list[Array]:
+    register(*text)
+    outputs = [jax.ShapeDtypeStruct(shape, jnp.float32) for shape in shapes]
+    return list(jax.ffi.ffi_call(text[0], outputs, vmap_method="sequential")(*inputs))
+
+
+@functools.cache
+def _forward_text(sizes: tuple[int, ...], number: int, squash: bool) -> tuple[str, str]:
+    """Name and LLVM module of: weights, biases, inputs -> the activations of every layer."""
+    count = len(sizes) - 1
+    writer = Writer()
+    below = f"%in{2 * count}"
+    for layer, (fewer, more) in enumerate(itertools.pairwise(sizes)):
+        out = f"%out{layer}"
+        writer.product(
+            (more, number, fewer), (f"%in{layer}", 1, more), (below, number), (out, number), f"%in{count + layer}"
+        )
+        if squash or layer < count - 1:
+            writer.elementwise(elementary.tanh, [out], out, more * number)
+        below = out
+    return writer.module([f"%in{i}" for i in range(2 * count + 1)] + [f"%out{i}" for i in range(count)])
+
+
+@functools.cache
+def _backward_text(sizes: tuple[int, ...], number: int, squash: bool) -> tuple[str, str]:
+    """Name and LLVM module of: weights, inputs, activations, cotangent -> cotangents of weights, biases and inputs.
+
+    Three outputs are room to work in.
+    """
+    count = len(sizes) - 1
+    writer = Writer()
+    room = [f"%out{2 * count + 1 + index}" for index in range(3)]
+    given, spare, turned = f"%in{2 * count + 1}", room[:2], room[2]
+    for layer in reversed(range(count)):
+        fewer, more = sizes[layer : layer + 2]
+        if squash or layer < count - 1:
+            slope = spare[0]
+            writer.elementwise(lambda g, h: g * (1.0 - h * h), [given, f"%in{count + 1 + layer}"], slope, more * number)
+            given, spare = slope, spare[::-1]
+        below = f"%in{count + layer}"  # the activations of the layer before, or the inputs
+        writer.transpose(given, turned, more, number)
+        writer.product((fewer, more, number), (below, number, 1), (turned, more), (f"%out{layer}", more))
+        writer.sum_rows(turned, f"%out{count + layer}", number, more)
+        target = spare[0] if layer else f"%out{2 * count}"
+        writer.product((fewer, number, more), (f"%in{layer}", more, 1), (given, number), (target, number))
+        given, spare = target, spare[::-1]
+    return writer.module([f"%in{i}" for i in range(2 * count + 2)] + [f"%out{i}" for i in range(2 * count + 4)])
+
+
+class Writer:
+    """The instructions of a kernel on whole arrays of floats."""
+
+    def __init__(self) -> None:
+        self._room: list[str] = []  # allocations, which LLVM turns into registers where they come first
+        self._lines: list[str] = []
+        self._vectors: set[int] = set()  # whose multiply-add is declared
+        self._count, self._block = 0, "entry"
+
+    def _new(self, instruction: str) -> str:
+        self._count += 1
+        self._lines.append(f"  %w{self._count} = {instruction}")
+        return f"%w{self._count}"
+
+    def _register(self, width: int) -> str:
+        self._count += 1
+        self._room.append(f"  %r{self._count} = alloca {_vector(width)}")
+        return f"%r{self._count}"
+
+    def _at(self, pointer: str, index: str | int) -> str:
+        return self._new(f"getelementptr float, ptr {pointer}, i64 {index}")
+
+    def _load(self, pointer: str, width: int = 0) -> str:
+        return self._new(f"load {_vector(width)}, ptr {pointer}, align 4")
+
+    def _store(self, value: str, pointer: str, width: int = 0) -> None:
+        self._lines.append(f"  store {_vector(width)} {value}, ptr {pointer}, align 4")
+
+    def _each(self, number: int, body: Callable[[str], Any], metadata: str = "") -> None:
+        """A loop; `body` writes the instructions of the index it is given."""
+        self._count += 1
+        name = f"loop{self._count}"
+        before, index, following = self._block, f"%i{self._count}", f"%n{self._count}"
+        self._lines += [
+            f"  br label %{name}",
+            f"{name}:",
+            f"  {index} = phi i64 [0, %{before}], [{following}, %{name}_next]",
+        ]
+        self._block = name
+        body(index)
+        self._lines += [
+            f"  br label %{name}_next",
+            f"{name}_next:",
+            f"  {following} = add nuw nsw i64 {index}, 1",
+            f"  %m{name} = icmp ult i64 {following}, {number}",
+            f"  br i1 %m{name}, label %{name}, label %{name}_end{metadata}",
+            f"{name}_end:",
+        ]
+        self._block = f"{name}_end"
+
+    def _columns(self, number: int, body: Callable[[str, int], Any]) -> None:
+        """All columns: in a loop, as many at once as two vectors hold, then those that are left."""
+        width = 2 * vector_width()
+        if number >= width:
+            self._each(number // width, lambda index: body(self._new(f"mul i64 {index}, {width}"), width))
+        if number % width:
+            body(str(number - number % width), number % width)
+
+    def _splat(self, value: str, width: int) -> str:
+        kind = _vector(width)
+        first = self._new(f"insertelement {kind} poison, float {value}, i64 0")
+        return self._new(f"shufflevector {kind} {first}, {kind} poison, <{width} x i32> zeroinitializer")
+
+    def product(
+        self,
+        shape: tuple[int, int, int],
+        left: tuple[str, int, int],
+        right: tuple[str, int],
+        out: tuple[str, int],
+        start: str | None = None,
+    ) -> None:
+        """A product of matrices: out[m, n] = start[m] + sum over k of left[m, k] * right[k, n].
+
+        Args:
+            shape: rows, columns and the length of the sum.
+            left: pointer, and the distance in memory from row to row and from column to column.
+            right: pointer, and the distance from row to row.
+            out: likewise.
+            start: pointer to one number for each row, None for zeros.
+        """
+        rows, columns, length = shape
+        tiles = -(-rows // ROWS)
+        edges = [rows * tile // tiles for tile in range(tiles + 1)]
+
+        def block(column: str, width: int) -> None:
+            self._vectors.add(width)
+            kind = _vector(width)
+            for low, high in itertools.pairwise(edges):
+                sums = []
+                for row in range(low, high):
+                    value = "zeroinitializer"
+                    if start is not None:
+                        value = self._splat(self._load(self._at(start, row)), width)
+                    sums.append(self._register(width))
+                    self._store(value, sums[-1], width)
+
+                def add(k: str, low: int = low, high: int = high, sums: list[str] = sums) -> None:
+                    place = self._new(f"mul i64 {k}, {right[1]}")
+                    across = self._load(self._at(self._at(right[0], column), place), width)
+                    place = self._new(f"mul i64 {k}, {left[2]}")
+                    down = self._at(left[0], place)
+                    for row, total in zip(range(low, high), sums, strict=True):
+                        factor = self._splat(self._load(self._at(down, row * left[1])), width)
+                        old = self._load(total, width)
+                        self._store(
+                            self._new(
+                                f"call {kind} @llvm.fmuladd.v{width}f32({kind} {factor}, {kind} {across}, {kind} {old})"
+                            ),
+                            total,
+                            width,
+                        )
+
+                self._each(length, add)
+                for row, total in zip(range(low, high), sums, strict=True):
+                    place = self._at(self._at(out[0], row * out[1]), column)
+                    self._store(self._load(total, width), place, width)
+
+        self._columns(columns, block)
+
+    def sum_rows(self, source: str, out: str, rows: int, columns: int) -> None:
+        """out[n] = sum over m of source[m, n]."""
+
+        def block(column: str, width: int) -> None:
+            kind = _vector(width)
+            total = self._register(width)
+            self._store("zeroinitializer", total, width)
+
+            def add(row: str) -> None:
+                place = self._at(self._at(source, column), self._new(f"mul i64 {row}, {columns}"))
+                old = self._load(total, width)
+                self._store(self._new(f"fadd {kind} {old}, {self._load(place, width)}"), total, width)
+
+            self._each(rows, add)
+            self._store(self._load(total, width), self._at(out, column), width)
+
+        self._columns(columns, block)
+
+    def elementwise(self, function: Callable[..., Any], sources: Sequence[str], out: str, number: int) -> None:
+        """out[i] = function(sources[i]), a function in JAX of numbers."""
+        traced = jax.make_jaxpr(function)(*[jax.ShapeDtypeStruct((), jnp.float32)] * len(sources))
+
+        def body(index: str) -> None:
+            self._count += 1
+            emitter = Emitter(f"%e{self._count}_")
+            values = [emitter.add(f"load float, ptr {self._at(source, index)}, align 4") for source in sources]
+            (result,) = emitter.run(traced.jaxpr, traced.consts, [np.array(value, object) for value in values])
+            self._lines += emitter.lines
+            self._store(str(result[()]), self._at(out, index))
+
+        self._each(number, body, ", !llvm.loop !0")
+
+    def transpose(self, source: str, out: str, rows: int, columns: int) -> None:
+        """out[n, m] = source[m, n]."""
+
+        def block(row: str | int, column: str | int, height: int, width: int) -> None:
+            offset = self._new(f"mul i64 {row}, {columns}")
+            first = self._at(self._at(source, offset), column)
+            offset = self._new(f"mul i64 {column}, {rows}")
+            target = self._at(self._at(out, offset), row)
+            lines = [self._load(self._at(first, index * columns), width) for index in range(height)]
+            for index, line in enumerate(self._turn(lines, height, width)):
+                self._store(line, self._at(target, index * rows), height)
+
+        for row in range(0, rows - rows % 8, 8):
+            self._each(columns // 8, lambda index, row=row: block(row, self._new(f"mul i64 {index}, 8"), 8, 8))
+        left = columns % 8
+        if left:
+            for row in range(0, rows, 8):
+                block(row, columns - left, min(8, rows - row), left)
+        if rows % 8 and columns >= 8:
+            self._each(
+                columns // 8, lambda index: block(rows - rows % 8, self._new(f"mul i64 {index}, 8"), rows % 8, 8)
+            )
+
+    def _turn(self, lines: list[str], height: int, width: int) -> list[str]:
+        """The columns of a block of at most 8 x 8 numbers, given its rows."""
+        if height == width == 8:
+            for step in (4, 2, 1):  # exchange of the halves of pairs of rows
+                low = [i if i & step == 0 else 8 + (i ^ step) for i in range(8)]
+                high = [i ^ step if i & step == 0 else 8 + i for i in range(8)]
+                new = list(lines)
+                for i in range(8):
+                    if i & step == 0:
+                        new[i] = self._shuffle(lines[i], lines[i | step], low, 8)
+                        new[i | step] = self._shuffle(lines[i], lines[i | step], high, 8)
+                lines = new
+            return lines
+        columns = []
+        for column in range(width):
+            value = "poison"
+            for row, line in enumerate(lines):
+                number = self._new(f"extractelement {_vector(width)} {line}, i64 {column}")
+                value = self._new(f"insertelement {_vector(height)} {value}, float {number}, i64 {row}")
+            columns.append(value)
+        return columns
+
+    def _shuffle(self, first: str, second: str, order: Sequence[int], width: int) -> str:
+        kind, mask = _vector(width), ", ".join(f"i32 {index}" for index in order)
+        return self._new(f"shufflevector {kind} {first}, {kind} {second}, <{len(order)} x i32> <{mask}>")
+
+    def module(self, buffers: Sequence[str]) -> tuple[str, str]:
+        """Name and text of the kernel."""
+        arguments = ", ".join(f"ptr noalias {buffer}" for buffer in buffers)
+        kinds = {width: _vector(width) for width in sorted(self._vectors)}
+        text = "\n".join(
+            [
+                *(f"declare {kind} @llvm.fmuladd.v{width}f32({kind}, {kind}, {kind})" for width, kind in kinds.items()),
+                f"define internal void @NAME_loop({arguments}) noinline {{",
+                "entry:",
+                *self._room,
+                *self._lines,
+                "  ret void",
+                "}",
+                handler(buffers),
+                *LOOP_METADATA,
+            ]
+        )
+        name = f"flytune_{hashlib.sha256(text.encode()).hexdigest()[:24]}"
+        return name, text.replace("NAME", name)
+
+
+def _vector(width: int) -> str:
+    return f"<{width} x float>" if width else "float"
