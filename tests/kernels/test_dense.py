@@ -6,7 +6,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax.flatten_util import ravel_pytree
 
+from flytune.control.policy import make_network
 from flytune.kernels.batched import available
 from flytune.kernels.dense import perceptron, plain
 
@@ -25,22 +27,23 @@ CASES = [  # sizes of the layers, batch
 def drawn(sizes, batch):
     rng = np.random.default_rng(0)
     layers = list(itertools.pairwise(sizes))
-    weights = tuple(jnp.asarray(rng.normal(size=pair) / pair[0] ** 0.5, jnp.float32) for pair in layers)
-    biases = tuple(jnp.asarray(rng.normal(size=more), jnp.float32) for _, more in layers)
-    inputs, cotangent = (jnp.asarray(rng.normal(size=(size, batch)), jnp.float32) for size in (sizes[0], sizes[-1]))
-    return (weights, biases, inputs), cotangent
+    weights = [rng.normal(size=pair) / pair[0] ** 0.5 for pair in layers]
+    parameters = np.concatenate([*(weight.ravel() for weight in weights), rng.normal(size=sum(sizes[1:]))])
+    inputs, cotangent = (rng.normal(size=(size, batch)) for size in (sizes[0], sizes[-1]))
+    return [jnp.asarray(each, jnp.float32) for each in (parameters, inputs, cotangent)]
 
 
 @pytest.mark.parametrize("squash", [True, False])
 @pytest.mark.parametrize(("sizes", "batch"), CASES)
 def test_outputs_and_gradients_are_those_of_jax(sizes, batch, squash):
-    arguments, cotangent = drawn(sizes, batch)
+    parameters, inputs, cotangent = drawn(sizes, batch)
 
     def value_and_gradient(function):
-        def weighed(*given):
-            return jnp.sum(cotangent * function(*given, squash=squash))
+        def weighed(parameters, inputs):
+            return jnp.sum(cotangent * function(parameters, sizes, inputs, squash=squash))
 
-        return function(*arguments, squash=squash), jax.jit(jax.grad(weighed, argnums=(0, 1, 2)))(*arguments)
+        outputs = function(parameters, sizes, inputs, squash=squash)
+        return outputs, jax.jit(jax.grad(weighed, argnums=(0, 1)))(parameters, inputs)
 
     found, expected = value_and_gradient(perceptron), value_and_gradient(plain)
     assert jax.tree.structure(found) == jax.tree.structure(expected)
@@ -49,7 +52,15 @@ def test_outputs_and_gradients_are_those_of_jax(sizes, batch, squash):
 
 
 def test_infinite_and_missing_numbers_stay_visible():
-    (weights, biases, inputs), _ = drawn((17, 64, 64, 4), 64)
+    sizes = (17, 64, 64, 4)
+    parameters, inputs, _ = drawn(sizes, 64)
     inputs = inputs.at[3, 5].set(jnp.nan)
-    outputs = np.asarray(perceptron(weights, biases, inputs))
+    outputs = np.asarray(perceptron(parameters, sizes, inputs))
     assert np.isnan(outputs[:, 5]).all() and np.isfinite(np.delete(outputs, 5, axis=1)).all()
+
+
+def test_the_vector_of_parameters_is_a_network_in_order():
+    network = make_network(jax.random.key(0), (17, 12, 10, 4), last_gain=1.0)
+    inputs = jax.random.normal(jax.random.key(1), (17, 20))
+    found = perceptron(ravel_pytree(network)[0], network.sizes, inputs)
+    np.testing.assert_allclose(found, network(inputs.T).T, atol=2e-6)

@@ -12,8 +12,9 @@ import dataclasses, json, sys
 import jax, jax.numpy as jnp, numpy as np
 traced = []
 def listen(event, seconds, **facts):
-    if event == "/jax/core/compile/jaxpr_trace_duration" and facts.get("fun_name", "").removeprefix("kept_") in ("start", "update"):
-        traced.append(facts["fun_name"].removeprefix("kept_"))
+    name = facts.get("fun_name", "").removeprefix("kept_")
+    if event == "/jax/core/compile/jaxpr_trace_duration" and name in ("start", "update"):
+        traced.append(name)
 jax.monitoring.register_event_duration_secs_listener(listen)
 from flytune.task.task import load_task
 from flytune.training import apg

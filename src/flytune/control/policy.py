@@ -34,6 +34,11 @@ class Network:
     weights: tuple[Float[Array, "_ _"], ...]  # inputs x outputs
     biases: tuple[Float[Array, "_"], ...]
 
+    @property
+    def sizes(self) -> tuple[int, ...]:
+        """The numbers of inputs, of each hidden layer and of outputs."""
+        return (*(weight.shape[0] for weight in self.weights), self.weights[-1].shape[1])
+
     def __call__(self, inputs: Float[Array, "*batch inputs"]) -> Float[Array, "*batch outputs"]:
         """The outputs for one input or a batch of them."""
         for weight, bias in zip(self.weights[:-1], self.biases[:-1], strict=True):
@@ -69,7 +74,7 @@ class Policy:
         return jnp.tanh(raw) if self.squash == "tanh" else jnp.clip(raw, -1.0, 1.0)
 
     def __repr__(self) -> str:
-        sizes = "-".join(map(str, [*(len(weight) for weight in self.actor.weights), len(self.actor.biases[-1])]))
+        sizes = "-".join(map(str, self.actor.sizes))
         known = {"task", "vehicle"} <= self.about.keys()
         made_for = f", {self.about['task']} on {self.about['vehicle']}" if known else ""
         return f"Policy({sizes}, {self.squash}{made_for})"

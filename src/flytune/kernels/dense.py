@@ -22,64 +22,60 @@ from flytune.kernels.native import LOOP_METADATA, handler, register, vector_widt
 
 ROWS = 6  # of a tile of a product; with two vectors of columns it fills the registers of AVX2
 
-Layers = tuple[tuple[Array, ...], tuple[Array, ...]]  # weights [inputs, outputs] and biases [outputs]
-
 
 def perceptron(
-    weights: Sequence[Float[Array, "_ _"]],
-    biases: Sequence[Float[Array, "_"]],
-    inputs: Float[Array, "inputs N"],
-    *,
-    squash: bool = False,
+    parameters: Float[Array, "P"], sizes: Sequence[int], inputs: Float[Array, "inputs N"], *, squash: bool = False
 ) -> Float[Array, "outputs N"]:
     """The outputs of a multilayer perceptron with tanh between its layers, for a batch along the last axis.
 
     Args:
-        weights: of each layer, [inputs, outputs].
-        biases: of each layer.
+        parameters: the weights [inputs, outputs] of all layers, then all biases, as one vector.
+        sizes: of the inputs, the hidden layers and the outputs.
         inputs: of the first layer.
         squash: whether tanh also follows the last layer.
     """
     if not available():
-        return plain(weights, biases, inputs, squash=squash)
-    return _perceptron(squash, (tuple(weights), tuple(biases)), inputs)
+        return plain(parameters, sizes, inputs, squash=squash)
+    return _perceptron(tuple(sizes), squash, parameters, inputs)
 
 
-def plain(weights: Sequence[Any], biases: Sequence[Any], inputs: Any, *, squash: bool = False) -> Any:
+def plain(parameters: Any, sizes: Sequence[int], inputs: Any, *, squash: bool = False) -> Any:
     """The same in JAX."""
-    for weight, bias in zip(weights[:-1], biases[:-1], strict=True):
-        inputs = jnp.tanh(weight.T @ inputs + bias[:, None])
-    outputs = weights[-1].T @ inputs + biases[-1][:, None]
-    return jnp.tanh(outputs) if squash else outputs
+    places = _places(sizes)
+    for layer, (fewer, more) in enumerate(itertools.pairwise(sizes)):
+        weight, bias = places[layer], places[len(sizes) - 1 + layer]
+        product = parameters[weight : weight + fewer * more].reshape(fewer, more).T @ inputs
+        inputs = product + parameters[bias : bias + more][:, None]
+        inputs = jnp.tanh(inputs) if squash or layer < len(sizes) - 2 else inputs
+    return inputs
 
 
-@functools.partial(jax.custom_vjp, nondiff_argnums=(0,))
-def _perceptron(squash: bool, layers: Layers, inputs: Array) -> Array:
-    return _forward(squash, layers, inputs)[0]
+def _places(sizes: Sequence[int]) -> list[int]:
+    """Where the weights of each layer, then the biases of each layer, and the end lie in the vector of parameters."""
+    lengths = [fewer * more for fewer, more in itertools.pairwise(sizes)] + list(sizes[1:])
+    return [0, *itertools.accumulate(lengths)]
 
 
-def _forward(squash: bool, layers: Layers, inputs: Array) -> tuple[Array, Any]:
-    sizes, number = _sizes(layers), inputs.shape[-1]
-    results = _call(_forward_text(sizes, number, squash), [*itertools.chain(*layers), inputs],
-                    [(size, number) for size in sizes[1:]])  # fmt: skip
-    return results[-1], (layers, inputs, results)
+@functools.partial(jax.custom_vjp, nondiff_argnums=(0, 1))
+def _perceptron(sizes: tuple[int, ...], squash: bool, parameters: Array, inputs: Array) -> Array:
+    return _forward(sizes, squash, parameters, inputs)[0]
 
 
-def _backward(squash: bool, kept: Any, cotangent: Array) -> tuple[Layers, Array]:
-    layers, inputs, activations = kept
-    sizes, number = _sizes(layers), inputs.shape[-1]
-    widest, count = max(sizes), len(layers[0])
-    shapes = [each.shape for each in itertools.chain(*layers)] + [inputs.shape] + [(widest, number)] * 3
-    text = _backward_text(sizes, number, squash)
-    results = _call(text, [*layers[0], inputs, *activations, cotangent], shapes)
-    return (tuple(results[:count]), tuple(results[count : 2 * count])), results[2 * count]
+def _forward(sizes: tuple[int, ...], squash: bool, parameters: Array, inputs: Array) -> tuple[Array, Any]:
+    number = inputs.shape[-1]
+    results = _call(_forward_text(sizes, number, squash), [parameters, inputs], [(size, number) for size in sizes[1:]])
+    return results[-1], (parameters, inputs, results)
+
+
+def _backward(sizes: tuple[int, ...], squash: bool, kept: Any, cotangent: Array) -> tuple[Array, Array]:
+    parameters, inputs, activations = kept
+    shapes = [parameters.shape, inputs.shape] + [(max(sizes), inputs.shape[-1])] * 3
+    text = _backward_text(sizes, inputs.shape[-1], squash)
+    gradient, below, *_ = _call(text, [parameters, inputs, *activations, cotangent], shapes)
+    return gradient, below
 
 
 _perceptron.defvjp(_forward, _backward)
-
-
-def _sizes(layers: Layers) -> tuple[int, ...]:
-    return (layers[0][0].shape[0], *(weight.shape[1] for weight in layers[0]))
 
 
 def _call(text: tuple[str, str], inputs: Sequence[Array], shapes: Sequence[tuple[int, ...]]) -> list[Array]:
@@ -90,45 +86,43 @@ def _call(text: tuple[str, str], inputs: Sequence[Array], shapes: Sequence[tuple
 
 @functools.cache
 def _forward_text(sizes: tuple[int, ...], number: int, squash: bool) -> tuple[str, str]:
-    """Name and LLVM module of: weights, biases, inputs -> the activations of every layer."""
-    count = len(sizes) - 1
-    writer = Writer()
-    below = f"%in{2 * count}"
+    """Name and LLVM module of: parameters, inputs -> the activations of every layer."""
+    count, places = len(sizes) - 1, _places(sizes)
+    writer, below = Writer(), "%in1"
     for layer, (fewer, more) in enumerate(itertools.pairwise(sizes)):
-        out = f"%out{layer}"
-        writer.product(
-            (more, number, fewer), (f"%in{layer}", 1, more), (below, number), (out, number), f"%in{count + layer}"
-        )
+        out, weight = f"%out{layer}", writer.at("%in0", places[layer])
+        bias = writer.at("%in0", places[count + layer])
+        writer.product((more, number, fewer), (weight, 1, more), (below, number), (out, number), bias)
         if squash or layer < count - 1:
             writer.elementwise(elementary.tanh, [out], out, more * number)
         below = out
-    return writer.module([f"%in{i}" for i in range(2 * count + 1)] + [f"%out{i}" for i in range(count)])
+    return writer.module(inputs=2, outputs=count)
 
 
 @functools.cache
 def _backward_text(sizes: tuple[int, ...], number: int, squash: bool) -> tuple[str, str]:
-    """Name and LLVM module of: weights, inputs, activations, cotangent -> cotangents of weights, biases and inputs.
+    """Name and LLVM module of: parameters, inputs, activations, cotangent -> cotangents of parameters and inputs.
 
-    Three outputs are room to work in.
+    Three more outputs are room to work in.
     """
-    count = len(sizes) - 1
-    writer = Writer()
-    room = [f"%out{2 * count + 1 + index}" for index in range(3)]
-    given, spare, turned = f"%in{2 * count + 1}", room[:2], room[2]
+    count, places = len(sizes) - 1, _places(sizes)
+    writer, given = Writer(), f"%in{2 + count}"
+    spare, turned = ["%out2", "%out3"], "%out4"
     for layer in reversed(range(count)):
         fewer, more = sizes[layer : layer + 2]
         if squash or layer < count - 1:
             slope = spare[0]
-            writer.elementwise(lambda g, h: g * (1.0 - h * h), [given, f"%in{count + 1 + layer}"], slope, more * number)
+            writer.elementwise(lambda g, h: g * (1.0 - h * h), [given, f"%in{2 + layer}"], slope, more * number)
             given, spare = slope, spare[::-1]
-        below = f"%in{count + layer}"  # the activations of the layer before, or the inputs
+        below = f"%in{1 + layer}"  # the activations of the layer before, or the inputs
         writer.transpose(given, turned, more, number)
-        writer.product((fewer, more, number), (below, number, 1), (turned, more), (f"%out{layer}", more))
-        writer.sum_rows(turned, f"%out{count + layer}", number, more)
-        target = spare[0] if layer else f"%out{2 * count}"
-        writer.product((fewer, number, more), (f"%in{layer}", more, 1), (given, number), (target, number))
+        to = writer.at("%out0", places[layer])
+        writer.product((fewer, more, number), (below, number, 1), (turned, more), (to, more))
+        writer.sum_rows(turned, writer.at("%out0", places[count + layer]), number, more)
+        weight, target = writer.at("%in0", places[layer]), spare[0] if layer else "%out1"
+        writer.product((fewer, number, more), (weight, more, 1), (given, number), (target, number))
         given, spare = target, spare[::-1]
-    return writer.module([f"%in{i}" for i in range(2 * count + 2)] + [f"%out{i}" for i in range(2 * count + 4)])
+    return writer.module(inputs=3 + count, outputs=5)
 
 
 class Writer:
@@ -150,7 +144,8 @@ class Writer:
         self._room.append(f"  %r{self._count} = alloca {_vector(width)}")
         return f"%r{self._count}"
 
-    def _at(self, pointer: str, index: str | int) -> str:
+    def at(self, pointer: str, index: str | int) -> str:
+        """The pointer to a number behind another."""
         return self._new(f"getelementptr float, ptr {pointer}, i64 {index}")
 
     def _load(self, pointer: str, width: int = 0) -> str:
@@ -223,17 +218,17 @@ class Writer:
                 for row in range(low, high):
                     value = "zeroinitializer"
                     if start is not None:
-                        value = self._splat(self._load(self._at(start, row)), width)
+                        value = self._splat(self._load(self.at(start, row)), width)
                     sums.append(self._register(width))
                     self._store(value, sums[-1], width)
 
                 def add(k: str, low: int = low, high: int = high, sums: list[str] = sums) -> None:
                     place = self._new(f"mul i64 {k}, {right[1]}")
-                    across = self._load(self._at(self._at(right[0], column), place), width)
+                    across = self._load(self.at(self.at(right[0], column), place), width)
                     place = self._new(f"mul i64 {k}, {left[2]}")
-                    down = self._at(left[0], place)
+                    down = self.at(left[0], place)
                     for row, total in zip(range(low, high), sums, strict=True):
-                        factor = self._splat(self._load(self._at(down, row * left[1])), width)
+                        factor = self._splat(self._load(self.at(down, row * left[1])), width)
                         old = self._load(total, width)
                         self._store(
                             self._new(
@@ -245,7 +240,7 @@ class Writer:
 
                 self._each(length, add)
                 for row, total in zip(range(low, high), sums, strict=True):
-                    place = self._at(self._at(out[0], row * out[1]), column)
+                    place = self.at(self.at(out[0], row * out[1]), column)
                     self._store(self._load(total, width), place, width)
 
         self._columns(columns, block)
@@ -259,12 +254,12 @@ class Writer:
             self._store("zeroinitializer", total, width)
 
             def add(row: str) -> None:
-                place = self._at(self._at(source, column), self._new(f"mul i64 {row}, {columns}"))
+                place = self.at(self.at(source, column), self._new(f"mul i64 {row}, {columns}"))
                 old = self._load(total, width)
                 self._store(self._new(f"fadd {kind} {old}, {self._load(place, width)}"), total, width)
 
             self._each(rows, add)
-            self._store(self._load(total, width), self._at(out, column), width)
+            self._store(self._load(total, width), self.at(out, column), width)
 
         self._columns(columns, block)
 
@@ -275,10 +270,10 @@ class Writer:
         def body(index: str) -> None:
             self._count += 1
             emitter = Emitter(f"%e{self._count}_")
-            values = [emitter.add(f"load float, ptr {self._at(source, index)}, align 4") for source in sources]
+            values = [emitter.add(f"load float, ptr {self.at(source, index)}, align 4") for source in sources]
             (result,) = emitter.run(traced.jaxpr, traced.consts, [np.array(value, object) for value in values])
             self._lines += emitter.lines
-            self._store(str(result[()]), self._at(out, index))
+            self._store(str(result[()]), self.at(out, index))
 
         self._each(number, body, ", !llvm.loop !0")
 
@@ -287,12 +282,12 @@ class Writer:
 
         def block(row: str | int, column: str | int, height: int, width: int) -> None:
             offset = self._new(f"mul i64 {row}, {columns}")
-            first = self._at(self._at(source, offset), column)
+            first = self.at(self.at(source, offset), column)
             offset = self._new(f"mul i64 {column}, {rows}")
-            target = self._at(self._at(out, offset), row)
-            lines = [self._load(self._at(first, index * columns), width) for index in range(height)]
+            target = self.at(self.at(out, offset), row)
+            lines = [self._load(self.at(first, index * columns), width) for index in range(height)]
             for index, line in enumerate(self._turn(lines, height, width)):
-                self._store(line, self._at(target, index * rows), height)
+                self._store(line, self.at(target, index * rows), height)
 
         for row in range(0, rows - rows % 8, 8):
             self._each(columns // 8, lambda index, row=row: block(row, self._new(f"mul i64 {index}, 8"), 8, 8))
@@ -331,8 +326,9 @@ class Writer:
         kind, mask = _vector(width), ", ".join(f"i32 {index}" for index in order)
         return self._new(f"shufflevector {kind} {first}, {kind} {second}, <{len(order)} x i32> <{mask}>")
 
-    def module(self, buffers: Sequence[str]) -> tuple[str, str]:
+    def module(self, inputs: int, outputs: int) -> tuple[str, str]:
         """Name and text of the kernel."""
+        buffers = [f"%in{index}" for index in range(inputs)] + [f"%out{index}" for index in range(outputs)]
         arguments = ", ".join(f"ptr noalias {buffer}" for buffer in buffers)
         kinds = {width: _vector(width) for width in sorted(self._vectors)}
         text = "\n".join(

@@ -18,6 +18,7 @@ from jaxtyping import Array, Float
 
 from flytune.config.pytree import pytree
 from flytune.control.policy import Network, Policy, make_network
+from flytune.kernels.dense import perceptron
 from flytune.kernels.programs import program
 from flytune.simulation.environment import Episode
 from flytune.simulation.rollout import Draw, reset_all
@@ -127,7 +128,7 @@ def rollout(
 
     def decide(memory: Any, observation: Array, draw: Array, episodes: Episode) -> Any:
         seen = observation * factor
-        mean = parameters.actor(seen)
+        mean = _outputs(parameters.actor, seen)
         action = mean + jnp.exp(parameters.log_std) * draw
         return memory, action, (seen, mean, action)
 
@@ -135,7 +136,9 @@ def rollout(
         task, decide, (episodes, ()), draws, record=lambda after, moved, outcome: (outcome, moved)
     )
     (seen, mean, action), following, (outcome, moved) = step.notes, step.following * factor, step.record
-    value, next_value = parameters.critic(seen)[..., 0], parameters.critic(following)[..., 0]
+    value, next_value = (
+        _outputs(parameters.critic, each.reshape(-1, SIZE)).reshape(steps, width) for each in (seen, following)
+    )
     advantage = advantages(
         outcome.reward,
         value,
@@ -153,6 +156,10 @@ def rollout(
         target=advantage + value,
     )
     return episodes, batch, rollout_metrics(task, outcome, moved.reward, moved.steps)
+
+
+def _outputs(network: Network, inputs: Float[Array, "batch inputs"]) -> Float[Array, "batch outputs"]:
+    return perceptron(ravel_pytree(network)[0], network.sizes, inputs.T).T
 
 
 def advantages(
@@ -211,17 +218,17 @@ def learn(
     )
 
     def epoch(carry: Any, key: Array) -> Any:
-        shuffled = columns[shuffle(key, samples)]
-        return jax.lax.scan(minibatch, carry, shuffled.reshape(-1, settings.minibatch, columns.shape[-1]))
+        shuffled = columns[shuffle(key, samples)].reshape(-1, settings.minibatch, columns.shape[-1])
+        return jax.lax.scan(minibatch, carry, jnp.swapaxes(shuffled, 1, 2))
 
     def minibatch(carry: Any, rows: Array) -> Any:
         flat, optimiser = carry
         part = Batch(
-            observation=rows[:, :SIZE],
-            action=rows[:, SIZE : SIZE + 4],
-            log_probability=rows[:, SIZE + 4],
-            advantage=rows[:, SIZE + 5],
-            target=rows[:, SIZE + 6],
+            observation=rows[:SIZE].T,
+            action=rows[SIZE : SIZE + 4].T,
+            log_probability=rows[SIZE + 4],
+            advantage=rows[SIZE + 5],
+            target=rows[SIZE + 6],
         )
         gradient, losses = jax.grad(lambda flat: loss(settings, restore(flat), part), has_aux=True)(flat)
         return descend(method, gradient, optimiser, flat), losses
@@ -250,11 +257,11 @@ def loss(settings: PpoSettings, parameters: Parameters, batch: Batch) -> tuple[A
     """The clipped surrogate, value and entropy loss of one minibatch, and its parts. Source: Schulman et al. 2017."""
     advantage = batch.advantage
     advantage = (advantage - jnp.mean(advantage)) / (jnp.std(advantage, ddof=1) + 1e-8)
-    logarithm = log_probability(parameters.actor(batch.observation), parameters.log_std, batch.action)
+    logarithm = log_probability(_outputs(parameters.actor, batch.observation), parameters.log_std, batch.action)
     ratio = jnp.exp(logarithm - batch.log_probability)
     clipped = jnp.clip(ratio, 1 - settings.clip_range, 1 + settings.clip_range)
     policy_loss = -jnp.mean(jnp.minimum(ratio * advantage, clipped * advantage))
-    value_loss = jnp.mean((parameters.critic(batch.observation)[..., 0] - batch.target) ** 2)
+    value_loss = jnp.mean((_outputs(parameters.critic, batch.observation)[:, 0] - batch.target) ** 2)
     entropy = jnp.sum(parameters.log_std) + 0.5 * 4 * math.log(2 * math.pi * math.e)
     total = policy_loss + settings.value_weight * value_loss - settings.entropy_weight * entropy
     parts = {
