@@ -10,6 +10,7 @@ import pytest
 from flytune.evaluation.fly import fly
 from flytune.evaluation.judge import judge
 from flytune.simulation import environment
+from flytune.simulation.rollout import Draw
 from flytune.task.observation import input_scale
 from flytune.task.task import load_task
 from flytune.training import apg
@@ -21,8 +22,12 @@ def train_state(small_task):
 
 
 def test_the_gradient_agrees_with_finite_differences_of_the_flown_reward(small_task, train_state):
+    shape = (small_task.apg.window, small_task.apg.environments)
+    noise, keys = (jax.random.split(jax.random.key(seed), shape) for seed in (1, 2))
+    draws = Draw(noise=noise, keys=keys)
+
     def cost(actor):
-        return apg._loss(small_task, small_task.apg, actor, train_state.episodes, jax.random.key(1))[0]
+        return apg._loss(small_task, small_task.apg, actor, train_state.episodes, draws)[0]
 
     value, gradient = jax.jit(jax.value_and_grad(cost))(train_state.actor)
     jitted = jax.jit(cost)

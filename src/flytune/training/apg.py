@@ -6,6 +6,7 @@ episode has no gradient; so each termination condition also adds a smooth barrie
 """
 
 import dataclasses
+from functools import partial
 from typing import Any
 
 import jax
@@ -13,6 +14,7 @@ import jax.numpy as jnp
 import optax
 import optax.contrib
 from jax.flatten_util import ravel_pytree
+from jax.sharding import NamedSharding, PartitionSpec
 from jaxtyping import Array, Float
 
 from flytune.config.pytree import pytree
@@ -24,7 +26,9 @@ from flytune.simulation.rollout import Draw, reset_all, rollout
 from flytune.task.observation import SIZE, input_scale
 from flytune.task.task import Task
 from flytune.task.training_settings import ApgSettings
-from flytune.training.update import averaged, descend, rollout_metrics
+from flytune.training.update import averaged, descend, metrics_of, rollout_sums
+
+PARTS = 2  # of a batch, which are computed apart
 
 
 @pytree
@@ -41,12 +45,17 @@ class TrainState:
 
 def policy(settings: ApgSettings, train_state: TrainState) -> Policy:
     """The policy that is flown: the averaged actor."""
-    return Policy(actor=train_state.ema, input_scale=input_scale(settings.input_scale), squash="tanh")
+    return Policy(actor=_here(train_state.ema), input_scale=input_scale(settings.input_scale), squash="tanh")
 
 
 def last_policy(settings: ApgSettings, train_state: TrainState) -> Policy:
     """The policy of the last update."""
-    return Policy(actor=train_state.actor, input_scale=input_scale(settings.input_scale), squash="tanh")
+    return Policy(actor=_here(train_state.actor), input_scale=input_scale(settings.input_scale), squash="tanh")
+
+
+def _here(network: Network) -> Network:
+    """A network on JAX's default device, wherever it was."""
+    return jax.tree.map(jnp.asarray, jax.device_get(network))
 
 
 def _optimiser(settings: ApgSettings) -> optax.GradientTransformation:
@@ -102,15 +111,44 @@ def warm_start(settings: ApgSettings, train_state: TrainState, policy: Policy) -
     return dataclasses.replace(train_state, actor=actor, ema=jax.tree.map(jnp.array, actor))
 
 
-@program(static=["settings"], donate=["train_state"])
 def update(task: Task, settings: ApgSettings, train_state: TrainState) -> tuple[TrainState, dict[str, Any]]:
-    """The training state after one update, and its metrics."""
+    """The training state after one update, and its metrics.
+
+    The batch is computed in two halves, one after the other or, where JAX has two devices, at the same time; the
+    numbers are the same bit by bit.
+    """
+    number = PARTS if settings.environments % PARTS == 0 else 1
+    devices = tuple(jax.devices()[:number]) if jax.device_count() >= number > 1 else ()
+    if devices:
+        train_state = jax.device_put(train_state, _shardings(devices, train_state))
+    return _update(task, settings, number, devices, train_state)
+
+
+def _shardings(devices: tuple[Any, ...], train_state: TrainState) -> TrainState:
+    """Where each array of a training state is: a part of the episodes on each device, the rest on all."""
+    mesh = jax.make_mesh((len(devices),), ("part",), devices=devices)
+    everywhere, parts = NamedSharding(mesh, PartitionSpec()), _along_last(train_state.episodes)
+    shardings = jax.tree.map(lambda _: everywhere, train_state)
+    return dataclasses.replace(shardings, episodes=jax.tree.map(partial(NamedSharding, mesh), parts))
+
+
+def _along_last(tree: Any) -> Any:
+    """How arrays are divided whose last axis is the batch."""
+    return jax.tree.map(lambda leaf: PartitionSpec(*[None] * (leaf.ndim - 1), "part"), tree)
+
+
+@program(static=["settings", "number", "devices"], donate=["train_state"])
+def _update(
+    task: Task, settings: ApgSettings, number: int, devices: tuple[Any, ...], train_state: TrainState
+) -> tuple[TrainState, dict[str, Any]]:
     key, flight_key = jax.random.split(train_state.key)
-    (_, (episodes, seen)), gradient = jax.value_and_grad(_loss, argnums=2, has_aux=True)(
-        task, settings, train_state.actor, train_state.episodes, flight_key
+    noise_key, reset_key = jax.random.split(flight_key)
+    shape = (settings.window, settings.environments)
+    draws = Draw(noise=jax.random.split(noise_key, shape), keys=jax.random.split(reset_key, shape))
+    gradient, episodes, sums = _in_parts(
+        task, settings, number, devices, train_state.actor, train_state.episodes, draws
     )
     actor, optimiser = descend(_optimiser(settings), gradient, train_state.optimiser, train_state.actor)
-    seen["gradient_norm"] = optax.tree.norm(gradient)
     after = TrainState(
         actor=actor,
         ema=averaged(train_state.ema, actor, settings.ema_decay, train_state.updates),
@@ -119,20 +157,58 @@ def update(task: Task, settings: ApgSettings, train_state: TrainState) -> tuple[
         key=key,
         updates=train_state.updates + 1,
     )
-    return after, seen
+    measured = metrics_of(sums)
+    return after, {
+        **measured,
+        "objective": sums["objective"] / sums["steps"],
+        "gradient_norm": optax.tree.norm(gradient),
+    }
 
 
-def _loss(task: Task, settings: ApgSettings, actor: Network, episodes: Episode, key: Array) -> Any:
-    """Mean cost per step of the whole batch, and the episodes it ends with."""
+def _in_parts(
+    task: Task,
+    settings: ApgSettings,
+    number: int,
+    devices: tuple[Any, ...],
+    actor: Network,
+    episodes: Episode,
+    draws: Draw,
+) -> tuple[Network, Episode, dict[str, Any]]:
+    """The gradient, the episodes after the window and the sums of `rollout_sums`, from parts of the batch."""
+
+    def part(actor: Network, episodes: Episode, draws: Draw) -> Any:
+        (_, (after, sums)), gradient = jax.value_and_grad(_loss, argnums=2, has_aux=True)(
+            task, settings, actor, episodes, draws
+        )
+        return (jax.tree.map(lambda leaf: leaf / number, gradient), sums), after
+
+    if devices:
+        mesh = jax.make_mesh((number,), ("part",), devices=devices)
+        divided = _along_last(episodes)
+        (gradient, sums), after = jax.shard_map(
+            lambda *given: (jax.lax.psum(part(*given)[0], "part"), part(*given)[1]),
+            mesh=mesh,
+            in_specs=(PartitionSpec(), divided, _along_last(draws)),
+            out_specs=(PartitionSpec(), divided),
+            check_vma=False,
+        )(actor, episodes, draws)
+        return gradient, after, sums
+    width = settings.environments // number
+    results = [
+        part(actor, *jax.tree.map(lambda leaf, low=low: leaf[..., low : low + width], (episodes, draws)))
+        for low in range(0, settings.environments, width)
+    ]
+    totals, afters = zip(*results, strict=True)
+    gradient, sums = jax.tree.map(lambda *leaves: sum(leaves[1:], start=leaves[0]), *totals)
+    return gradient, jax.tree.map(lambda *leaves: jnp.concatenate(leaves, axis=-1), *afters), sums
+
+
+def _loss(task: Task, settings: ApgSettings, actor: Network, episodes: Episode, draws: Draw) -> Any:
+    """Mean cost per step of a batch, the episodes it ends with, and the sums for its metrics."""
     task = dataclasses.replace(task, initial_state=settings.initial_state)
     first, *others = actor.weights
     scaled = dataclasses.replace(actor, weights=(first * input_scale(settings.input_scale)[:, None], *others))
     parameters, sizes = ravel_pytree(scaled)[0], actor.sizes
-    noise_key, reset_key = jax.random.split(key)
-    draws = Draw(
-        noise=jax.random.split(noise_key, (settings.window, settings.environments)),
-        keys=jax.random.split(reset_key, (settings.window, settings.environments)),
-    )
 
     def decide(memory: Any, observation: Array, draw: Any, episodes: Episode) -> Any:
         return memory, perceptron(parameters, sizes, observation.T, squash=True).T, ()
@@ -143,5 +219,5 @@ def _loss(task: Task, settings: ApgSettings, actor: Network, episodes: Episode, 
 
     (episodes, _), step = rollout(task, decide, (episodes, ()), draws, record=record, slack=settings.termination_slack)
     worth, outcome, moved = step.record
-    metrics = rollout_metrics(task, outcome, moved.reward, moved.steps)
-    return -jnp.mean(worth), (episodes, {**metrics, "objective": jnp.mean(worth)})
+    sums = rollout_sums(task, outcome, moved.reward, moved.steps)
+    return -jnp.mean(worth), (episodes, {**sums, "objective": jnp.sum(worth)})

@@ -61,21 +61,40 @@ def rollout_metrics(
         episode_reward: [time, environment], the sum of the rewards of each episode so far.
         episode_length: [time, environment], the number of steps of each episode so far.
     """
+    return metrics_of(rollout_sums(task, steps, episode_reward, episode_length))
+
+
+def rollout_sums(task: Task, steps: Outcome | Transition, episode_reward: Any, episode_length: Any) -> dict[str, Any]:
+    """What `metrics_of` needs, as sums, so that those of the parts of a batch can be added; see `rollout_metrics`."""
     xp: Any = np if isinstance(steps.reward, np.ndarray) else jnp
     ended = steps.terminated | steps.truncated
-    number = xp.sum(ended)
-
-    def mean_at_end(values: Any) -> Any:
-        return xp.where(number > 0, xp.sum(xp.where(ended, values, 0)) / xp.maximum(number, 1), xp.nan)
-
     codes = xp.arange(len(causes(task.termination)))
     return {
-        "reward": xp.mean(steps.reward),
-        "terms": {name: xp.mean(values) for name, values in steps.terms.items()},
+        "steps": xp.asarray(float(ended.size)),
+        "reward": xp.sum(steps.reward),
+        "terms": {name: xp.sum(values) for name, values in steps.terms.items()},
         "terminations": xp.sum(steps.cause[..., None] == codes, axis=(0, 1)),
+        "episodes": xp.sum(ended),
+        "episode_reward": xp.sum(xp.where(ended, episode_reward, 0)),
+        "episode_length": xp.sum(xp.where(ended, episode_length, 0)),
+    }
+
+
+def metrics_of(sums: dict[str, Any]) -> dict[str, Any]:
+    """The metrics of a rollout, see `rollout_metrics`, from `rollout_sums`."""
+    xp: Any = np if isinstance(sums["reward"], np.floating) else jnp
+    number = sums["episodes"]
+
+    def mean_at_end(total: Any) -> Any:
+        return xp.where(number > 0, total / xp.maximum(number, 1), xp.nan)
+
+    return {
+        "reward": sums["reward"] / sums["steps"],
+        "terms": {name: total / sums["steps"] for name, total in sums["terms"].items()},
+        "terminations": sums["terminations"],
         "episodes": number,
-        "episode_reward": mean_at_end(episode_reward),
-        "episode_length": mean_at_end(episode_length),
+        "episode_reward": mean_at_end(sums["episode_reward"]),
+        "episode_length": mean_at_end(sums["episode_length"]),
     }
 
 
