@@ -19,7 +19,7 @@ from jax.extend.core import jaxpr_as_fun
 from jaxtyping import Array
 
 from flytune.kernels.emit import Unsupported
-from flytune.kernels.native import module, register
+from flytune.kernels.native import loop, module, register
 
 SWITCH = "FLYTUNE_KERNELS"  # 0 in the environment switches kernels off
 
@@ -48,24 +48,12 @@ def batched(function: Callable[..., Any], shared: Any = ()) -> Callable[..., Any
     plain = jax.checkpoint(jax.vmap(functools.partial(function, shared), in_axes=-1, out_axes=-1), prevent_cse=False)
     if not available():
         return plain
-    leaves, structure = jax.tree.flatten(shared)
-    packed = _pack([jnp.asarray(leaf) for leaf in leaves])
+    prepared = Prepared(function, shared)
 
     def call(*inputs: Any) -> Any:
-        flat, form = jax.tree.flatten(inputs)
-        is_key = [jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key) for leaf in flat]
-        flat = [_words(leaf) if key else leaf for leaf, key in zip(flat, is_key, strict=True)]
-
-        def one(parts: Flat, values: Flat) -> Any:
-            numbers = [
-                jax.random.wrap_key_data(leaf) if key else leaf for leaf, key in zip(values, is_key, strict=True)
-            ]
-            whole = jax.tree.unflatten(structure, _unpack(parts, leaves))
-            return function(whole, *jax.tree.unflatten(form, numbers))
-
-        kernel = _Kernel(one, packed, flat)
+        kernel, flat = prepared.kernel(*inputs)
         try:
-            outputs: Any = _run(kernel, packed, flat)
+            outputs: Any = _run(kernel, prepared.packed, flat)
         except Unsupported as error:
             warnings.warn(f"kernels: {error} of JAX has no form as a loop here; this runs as slower JAX.", stacklevel=2)
             return plain(*inputs)
@@ -74,7 +62,31 @@ def batched(function: Callable[..., Any], shared: Any = ()) -> Callable[..., Any
     return call
 
 
-class _Kernel:
+class Prepared:
+    """A function of one element and what it shares with the others, whose numbers are packed: `packed`."""
+
+    def __init__(self, function: Callable[..., Any], shared: Any) -> None:
+        self._function = function
+        self._leaves, self._structure = jax.tree.flatten(shared)
+        self.packed = _pack([jnp.asarray(leaf) for leaf in self._leaves])
+
+    def kernel(self, *inputs: Any) -> tuple["Kernel", Flat]:
+        """The kernel for inputs of these shapes, and the inputs as it takes them."""
+        flat, form = jax.tree.flatten(inputs)
+        is_key = [jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key) for leaf in flat]
+        flat = [words(leaf) if key else leaf for leaf, key in zip(flat, is_key, strict=True)]
+
+        def one(parts: Flat, values: Flat) -> Any:
+            numbers = [
+                jax.random.wrap_key_data(leaf) if key else leaf for leaf, key in zip(values, is_key, strict=True)
+            ]
+            whole = jax.tree.unflatten(self._structure, _unpack(parts, self._leaves))
+            return self._function(whole, *jax.tree.unflatten(form, numbers))
+
+        return Kernel(one, self.packed, flat), flat
+
+
+class Kernel:
     """One function, its loop, and the loops of its gradients."""
 
     def __init__(self, one: Callable[[Flat, Flat], Any], packed: Flat, flat: Flat) -> None:
@@ -83,11 +95,11 @@ class _Kernel:
         self._inputs = [jax.ShapeDtypeStruct(leaf.shape[:-1], leaf.dtype) for leaf in flat]
         closed, shape = jax.make_jaxpr(one, return_shape=True)(self._kinds, self._inputs)
         self.form = jax.tree.structure(shape)
-        self._closed, self._function = closed, jaxpr_as_fun(closed)
+        self.jaxpr, self._function = closed, jaxpr_as_fun(closed)
 
     def __call__(self, packed: Flat, flat: Flat) -> list[Array]:
         """The outputs of every element."""
-        return self._loop(self._closed, [*packed, *flat], len(packed))
+        return self._loop(self.jaxpr, [*packed, *flat], len(packed))
 
     def gradient(
         self, packed: Flat, flat: Flat, given: Sequence[Any], wanted: Sequence[bool]
@@ -103,6 +115,15 @@ class _Kernel:
         variables = [*packed, *flat]
         chosen = [index for index, each in enumerate(wanted) if each]
         known = [index for index, each in enumerate(given) if each is not None]
+        closed = self.gradient_jaxpr(chosen, known)
+        found: list[Any] = [None] * len(variables)
+        outputs = self._loop(closed, [*variables, *(given[index] for index in known)], len(packed))
+        for index, output in zip(chosen, outputs, strict=True):
+            found[index] = jnp.sum(output, axis=-1) if index < len(packed) else output
+        return found[: len(packed)], found[len(packed) :]
+
+    def gradient_jaxpr(self, chosen: Sequence[int], known: Sequence[int]) -> Any:
+        """The function of one element: all inputs, cotangents of outputs `known` -> cotangents of inputs `chosen`."""
         kinds = [*self._kinds, *self._inputs]
 
         def one(values: Flat, cotangents: Flat) -> Any:
@@ -115,24 +136,20 @@ class _Kernel:
 
             return jax.vjp(outputs, [values[index] for index in chosen])[1](list(cotangents))[0]
 
-        results = [self._closed.out_avals[index] for index in known]
-        closed = jax.make_jaxpr(one)(kinds, [jax.ShapeDtypeStruct(kind.shape, kind.dtype) for kind in results])
-        found: list[Any] = [None] * len(variables)
-        outputs = self._loop(closed, [*variables, *(given[index] for index in known)], len(packed))
-        for index, output in zip(chosen, outputs, strict=True):
-            found[index] = jnp.sum(output, axis=-1) if index < len(packed) else output
-        return found[: len(packed)], found[len(packed) :]
+        results = [self.jaxpr.out_avals[index] for index in known]
+        return jax.make_jaxpr(one)(kinds, [jax.ShapeDtypeStruct(kind.shape, kind.dtype) for kind in results])
 
     def _loop(self, closed: Any, values: Flat, shared: int) -> list[Array]:
         batched = [index >= shared for index in range(len(values))]
-        name, text = module(closed, batched, self.number)
+        text = loop("loop", closed, batched, self.number)
+        name, text = module([text], "loop", len(values), len(closed.out_avals))
         register(name, text)
         outputs = [jax.ShapeDtypeStruct((*kind.shape, self.number), kind.dtype) for kind in closed.out_avals]
         return list(jax.ffi.ffi_call(name, outputs, vmap_method="sequential")(*values))
 
 
 @functools.partial(jax.custom_vjp, nondiff_argnums=(0,))
-def _run(kernel: _Kernel, packed: Flat, flat: Flat) -> list[Array]:
+def _run(kernel: Kernel, packed: Flat, flat: Flat) -> list[Array]:
     return kernel(packed, flat)
 
 
@@ -141,13 +158,13 @@ class _Wanted(tuple[bool, ...]):
     """Which inputs a gradient is wanted of; part of the structure, not of the numbers."""
 
 
-def _forward(kernel: _Kernel, packed: Flat, flat: Flat) -> Any:
+def _forward(kernel: Kernel, packed: Flat, flat: Flat) -> Any:
     wanted = _Wanted(each.perturbed and each.value.dtype == jnp.float32 for each in (*packed, *flat))
     packed, flat = [each.value for each in packed], [each.value for each in flat]
     return kernel(packed, flat), (packed, flat, wanted)
 
 
-def _backward(kernel: _Kernel, kept: Any, cotangents: Flat) -> Any:
+def _backward(kernel: Kernel, kept: Any, cotangents: Flat) -> Any:
     packed, flat, wanted = kept
     none = [isinstance(each, SymbolicZero) or each.dtype == jax.dtypes.float0 for each in cotangents]
     given = [None if zero else each for each, zero in zip(cotangents, none, strict=True)]
@@ -157,9 +174,9 @@ def _backward(kernel: _Kernel, kept: Any, cotangents: Flat) -> Any:
 _run.defvjp(_forward, _backward, symbolic_zeros=True)
 
 
-def _words(keys: Array) -> Array:
-    """Keys of random numbers [N] as their words [2, N]."""
-    return jnp.moveaxis(jax.random.key_data(keys), -1, 0)
+def words(keys: Array) -> Array:
+    """Keys of random numbers [..., N] as their words [..., 2, N]."""
+    return jnp.swapaxes(jax.random.key_data(keys), -1, -2)
 
 
 def _pack(leaves: Sequence[Array]) -> list[Array]:

@@ -5,7 +5,6 @@ as long as the arithmetic. Here the batch is the last axis, so that the arithmet
 """
 
 import functools
-import hashlib
 import itertools
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -15,11 +14,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from flytune.config.pytree import pytree, static
 from flytune.kernels import elementary
 from flytune.kernels.batched import available
 from flytune.kernels.emit import Emitter
-from flytune.kernels.native import LOOP_METADATA, handler, register, vector_width
+from flytune.kernels.native import function, module, register, vector_width
 
+ZERO = "0.0"
 ROWS = 6  # of a tile of a product; with two vectors of columns it fills the registers of AVX2
 
 
@@ -56,6 +57,19 @@ def _places(sizes: Sequence[int]) -> list[int]:
     return [0, *itertools.accumulate(lengths)]
 
 
+@pytree
+class Actor:
+    """A perceptron that gives the actions in a rollout. The loop over time is then part of the kernel, see `window`."""
+
+    parameters: Float[Array, "P"]  # see `perceptron`
+    sizes: tuple[int, ...] = static()
+    squash: bool = static()
+
+    def __call__(self, memory: Any, observation: Float[Array, "N 17"], draw: Any, episodes: Any) -> Any:
+        """The memory, actions [N, 4] and nothing to note."""
+        return memory, perceptron(self.parameters, self.sizes, observation.T, squash=self.squash).T, ()
+
+
 @functools.partial(jax.custom_vjp, nondiff_argnums=(0, 1))
 def _perceptron(sizes: tuple[int, ...], squash: bool, parameters: Array, inputs: Array) -> Array:
     return _forward(sizes, squash, parameters, inputs)[0]
@@ -63,14 +77,15 @@ def _perceptron(sizes: tuple[int, ...], squash: bool, parameters: Array, inputs:
 
 def _forward(sizes: tuple[int, ...], squash: bool, parameters: Array, inputs: Array) -> tuple[Array, Any]:
     number = inputs.shape[-1]
-    results = _call(_forward_text(sizes, number, squash), [parameters, inputs], [(size, number) for size in sizes[1:]])
+    text = forward_function("dense", sizes, number, squash)
+    results = _call(text, [parameters, inputs], [(size, number) for size in sizes[1:]])
     return results[-1], (parameters, inputs, results)
 
 
 def _backward(sizes: tuple[int, ...], squash: bool, kept: Any, cotangent: Array) -> tuple[Array, Array]:
     parameters, inputs, activations = kept
     shapes = [parameters.shape, inputs.shape] + [(max(sizes), inputs.shape[-1])] * 3
-    text = _backward_text(sizes, inputs.shape[-1], squash)
+    text = backward_function("dense", sizes, inputs.shape[-1], squash)
     gradient, below, *_ = _call(text, [parameters, inputs, *activations, cotangent], shapes)
     return gradient, below
 
@@ -78,15 +93,16 @@ def _backward(sizes: tuple[int, ...], squash: bool, kept: Any, cotangent: Array)
 _perceptron.defvjp(_forward, _backward)
 
 
-def _call(text: tuple[str, str], inputs: Sequence[Array], shapes: Sequence[tuple[int, ...]]) -> list[Array]:
-    register(*text)
+def _call(text: str, inputs: Sequence[Array], shapes: Sequence[tuple[int, ...]]) -> list[Array]:
+    name, module_text = module([text], "dense", len(inputs), len(shapes))
+    register(name, module_text)
     outputs = [jax.ShapeDtypeStruct(shape, jnp.float32) for shape in shapes]
-    return list(jax.ffi.ffi_call(text[0], outputs, vmap_method="sequential")(*inputs))
+    return list(jax.ffi.ffi_call(name, outputs, vmap_method="sequential")(*inputs))
 
 
 @functools.cache
-def _forward_text(sizes: tuple[int, ...], number: int, squash: bool) -> tuple[str, str]:
-    """Name and LLVM module of: parameters, inputs -> the activations of every layer."""
+def forward_function(name: str, sizes: tuple[int, ...], number: int, squash: bool) -> str:
+    """In LLVM: parameters, inputs -> the activations of every layer."""
     count, places = len(sizes) - 1, _places(sizes)
     writer, below = Writer(), "%in1"
     for layer, (fewer, more) in enumerate(itertools.pairwise(sizes)):
@@ -96,14 +112,14 @@ def _forward_text(sizes: tuple[int, ...], number: int, squash: bool) -> tuple[st
         if squash or layer < count - 1:
             writer.elementwise(elementary.tanh, [out], out, more * number)
         below = out
-    return writer.module(inputs=2, outputs=count)
+    return writer.function(name, 2, count)
 
 
 @functools.cache
-def _backward_text(sizes: tuple[int, ...], number: int, squash: bool) -> tuple[str, str]:
-    """Name and LLVM module of: parameters, inputs, activations, cotangent -> cotangents of parameters and inputs.
+def backward_function(name: str, sizes: tuple[int, ...], number: int, squash: bool, add: bool = False) -> str:
+    """In LLVM: parameters, inputs, activations, cotangent -> cotangents of parameters and inputs.
 
-    Three more outputs are room to work in.
+    Three more outputs are room to work in. The cotangents of the parameters may be added to what is there.
     """
     count, places = len(sizes) - 1, _places(sizes)
     writer, given = Writer(), f"%in{2 + count}"
@@ -117,12 +133,12 @@ def _backward_text(sizes: tuple[int, ...], number: int, squash: bool) -> tuple[s
         below = f"%in{1 + layer}"  # the activations of the layer before, or the inputs
         writer.transpose(given, turned, more, number)
         to = writer.at("%out0", places[layer])
-        writer.product((fewer, more, number), (below, number, 1), (turned, more), (to, more))
-        writer.sum_rows(turned, writer.at("%out0", places[count + layer]), number, more)
+        writer.product((fewer, more, number), (below, number, 1), (turned, more), (to, more), add=add)
+        writer.sum_rows(turned, writer.at("%out0", places[count + layer]), number, more, add=add)
         weight, target = writer.at("%in0", places[layer]), spare[0] if layer else "%out1"
         writer.product((fewer, number, more), (weight, more, 1), (given, number), (target, number))
         given, spare = target, spare[::-1]
-    return writer.module(inputs=3 + count, outputs=5)
+    return writer.function(name, 3 + count, 5)
 
 
 class Writer:
@@ -131,7 +147,6 @@ class Writer:
     def __init__(self) -> None:
         self._room: list[str] = []  # allocations, which LLVM turns into registers where they come first
         self._lines: list[str] = []
-        self._vectors: set[int] = set()  # whose multiply-add is declared
         self._count, self._block = 0, "entry"
 
     def _new(self, instruction: str) -> str:
@@ -154,7 +169,7 @@ class Writer:
     def _store(self, value: str, pointer: str, width: int = 0) -> None:
         self._lines.append(f"  store {_vector(width)} {value}, ptr {pointer}, align 4")
 
-    def _each(self, number: int, body: Callable[[str], Any], metadata: str = "") -> None:
+    def each(self, number: int, body: Callable[[str], Any], metadata: str = "") -> None:
         """A loop; `body` writes the instructions of the index it is given."""
         self._count += 1
         name = f"loop{self._count}"
@@ -180,7 +195,7 @@ class Writer:
         """All columns: in a loop, as many at once as two vectors hold, then those that are left."""
         width = 2 * vector_width()
         if number >= width:
-            self._each(number // width, lambda index: body(self._new(f"mul i64 {index}, {width}"), width))
+            self.each(number // width, lambda index: body(self._new(f"mul i64 {index}, {width}"), width))
         if number % width:
             body(str(number - number % width), number % width)
 
@@ -196,6 +211,8 @@ class Writer:
         right: tuple[str, int],
         out: tuple[str, int],
         start: str | None = None,
+        *,
+        add: bool = False,
     ) -> None:
         """A product of matrices: out[m, n] = start[m] + sum over k of left[m, k] * right[k, n].
 
@@ -205,24 +222,26 @@ class Writer:
             right: pointer, and the distance from row to row.
             out: likewise.
             start: pointer to one number for each row, None for zeros.
+            add: whether the product is added to what is in `out`.
         """
         rows, columns, length = shape
         tiles = -(-rows // ROWS)
         edges = [rows * tile // tiles for tile in range(tiles + 1)]
 
         def block(column: str, width: int) -> None:
-            self._vectors.add(width)
             kind = _vector(width)
             for low, high in itertools.pairwise(edges):
                 sums = []
                 for row in range(low, high):
                     value = "zeroinitializer"
-                    if start is not None:
+                    if add:
+                        value = self._load(self.at(self.at(out[0], row * out[1]), column), width)
+                    elif start is not None:
                         value = self._splat(self._load(self.at(start, row)), width)
                     sums.append(self._register(width))
                     self._store(value, sums[-1], width)
 
-                def add(k: str, low: int = low, high: int = high, sums: list[str] = sums) -> None:
+                def multiply_and_add(k: str, low: int = low, high: int = high, sums: list[str] = sums) -> None:
                     place = self._new(f"mul i64 {k}, {right[1]}")
                     across = self._load(self.at(self.at(right[0], column), place), width)
                     place = self._new(f"mul i64 {k}, {left[2]}")
@@ -238,34 +257,34 @@ class Writer:
                             width,
                         )
 
-                self._each(length, add)
+                self.each(length, multiply_and_add)
                 for row, total in zip(range(low, high), sums, strict=True):
                     place = self.at(self.at(out[0], row * out[1]), column)
                     self._store(self._load(total, width), place, width)
 
         self._columns(columns, block)
 
-    def sum_rows(self, source: str, out: str, rows: int, columns: int) -> None:
-        """out[n] = sum over m of source[m, n]."""
+    def sum_rows(self, source: str, out: str, rows: int, columns: int, *, add: bool = False) -> None:
+        """out[n] = sum over m of source[m, n], or that added to what is in `out`."""
 
         def block(column: str, width: int) -> None:
             kind = _vector(width)
             total = self._register(width)
-            self._store("zeroinitializer", total, width)
+            self._store(self._load(self.at(out, column), width) if add else "zeroinitializer", total, width)
 
-            def add(row: str) -> None:
+            def add_row(row: str) -> None:
                 place = self.at(self.at(source, column), self._new(f"mul i64 {row}, {columns}"))
                 old = self._load(total, width)
                 self._store(self._new(f"fadd {kind} {old}, {self._load(place, width)}"), total, width)
 
-            self._each(rows, add)
+            self.each(rows, add_row)
             self._store(self._load(total, width), self.at(out, column), width)
 
         self._columns(columns, block)
 
-    def elementwise(self, function: Callable[..., Any], sources: Sequence[str], out: str, number: int) -> None:
-        """out[i] = function(sources[i]), a function in JAX of numbers."""
-        traced = jax.make_jaxpr(function)(*[jax.ShapeDtypeStruct((), jnp.float32)] * len(sources))
+    def elementwise(self, formula: Callable[..., Any], sources: Sequence[str], out: str, number: int) -> None:
+        """out[i] = formula(sources[i]), a function in JAX of numbers."""
+        traced = jax.make_jaxpr(formula)(*[jax.ShapeDtypeStruct((), jnp.float32)] * len(sources))
 
         def body(index: str) -> None:
             self._count += 1
@@ -275,7 +294,7 @@ class Writer:
             self._lines += emitter.lines
             self._store(str(result[()]), self.at(out, index))
 
-        self._each(number, body, ", !llvm.loop !0")
+        self.each(number, body, ", !llvm.loop !0")
 
     def transpose(self, source: str, out: str, rows: int, columns: int) -> None:
         """out[n, m] = source[m, n]."""
@@ -290,15 +309,13 @@ class Writer:
                 self._store(line, self.at(target, index * rows), height)
 
         for row in range(0, rows - rows % 8, 8):
-            self._each(columns // 8, lambda index, row=row: block(row, self._new(f"mul i64 {index}, 8"), 8, 8))
+            self.each(columns // 8, lambda index, row=row: block(row, self._new(f"mul i64 {index}, 8"), 8, 8))
         left = columns % 8
         if left:
             for row in range(0, rows, 8):
                 block(row, columns - left, min(8, rows - row), left)
         if rows % 8 and columns >= 8:
-            self._each(
-                columns // 8, lambda index: block(rows - rows % 8, self._new(f"mul i64 {index}, 8"), rows % 8, 8)
-            )
+            self.each(columns // 8, lambda index: block(rows - rows % 8, self._new(f"mul i64 {index}, 8"), rows % 8, 8))
 
     def _turn(self, lines: list[str], height: int, width: int) -> list[str]:
         """The columns of a block of at most 8 x 8 numbers, given its rows."""
@@ -326,26 +343,22 @@ class Writer:
         kind, mask = _vector(width), ", ".join(f"i32 {index}" for index in order)
         return self._new(f"shufflevector {kind} {first}, {kind} {second}, <{len(order)} x i32> <{mask}>")
 
-    def module(self, inputs: int, outputs: int) -> tuple[str, str]:
-        """Name and text of the kernel."""
-        buffers = [f"%in{index}" for index in range(inputs)] + [f"%out{index}" for index in range(outputs)]
-        arguments = ", ".join(f"ptr noalias {buffer}" for buffer in buffers)
-        kinds = {width: _vector(width) for width in sorted(self._vectors)}
-        text = "\n".join(
-            [
-                *(f"declare {kind} @llvm.fmuladd.v{width}f32({kind}, {kind}, {kind})" for width, kind in kinds.items()),
-                f"define internal void @NAME_loop({arguments}) noinline {{",
-                "entry:",
-                *self._room,
-                *self._lines,
-                "  ret void",
-                "}",
-                handler(buffers),
-                *LOOP_METADATA,
-            ]
-        )
-        name = f"flytune_{hashlib.sha256(text.encode()).hexdigest()[:24]}"
-        return name, text.replace("NAME", name)
+    def copy(self, source: str | None, out: str, number: int) -> None:
+        """out[i] = source[i], or 0 where there is no source."""
+        self.each(number, lambda i: self._store(self._load(self.at(source, i)) if source else ZERO, self.at(out, i)))
+
+    def call(self, name: str, *pointers: str) -> None:
+        """A call of a function in LLVM, see `native.function`."""
+        self._lines.append(f"  call void @{name}({', '.join(f'ptr {pointer}' for pointer in pointers)})")
+
+    def times(self, index: str, factor: int, before: int = 0) -> str:
+        """before + factor * index."""
+        product = self._new(f"mul i64 {index}, {factor}")
+        return self._new(f"add i64 {product}, {before}")
+
+    def function(self, name: str, inputs: int, outputs: int) -> str:
+        """The function in LLVM, see `native.function`."""
+        return function(name, inputs, outputs, ["entry:", *self._room, *self._lines])
 
 
 def _vector(width: int) -> str:

@@ -23,12 +23,15 @@ WIDTH = 16  # elements that the loop computes at once
 # bytes from the start of XLA's structures: the frame, the metadata it may ask for, a buffer
 ARGUMENTS, RESULTS, EXTENSION, METADATA, MAJOR, MINOR, DATA = 72, 112, 8, 24, 24, 28, 24
 VERSION = (0, 1)  # of the interface that these offsets belong to
-DECLARATIONS = "\n".join(
-    [f"declare float @llvm.{name}.f32(float)" for name in ("sqrt", "fabs", "floor")]
-    + [f"declare float @llvm.{name}.f32(float, float)" for name in ("maximum", "minimum")]
-    + [f"declare i32 @llvm.{name}.sat.i32.f32(float)" for name in ("fptosi", "fptoui")]
+DECLARATIONS = (
+    *(f"declare float @llvm.{name}.f32(float)" for name in ("sqrt", "fabs", "floor")),
+    *(f"declare float @llvm.{name}.f32(float, float)" for name in ("maximum", "minimum")),
+    *(f"declare i32 @llvm.{name}.sat.i32.f32(float)" for name in ("fptosi", "fptoui")),
+    *(
+        f"declare <{width} x float> @llvm.fmuladd.v{width}f32({', '.join([f'<{width} x float>'] * 3)})"
+        for width in range(1, 33)
+    ),
 )
-
 LOOP_METADATA = (
     "!0 = distinct !{!0, !1, !2, !3}",
     '!1 = !{!"llvm.loop.vectorize.enable", i1 true}',
@@ -37,10 +40,35 @@ LOOP_METADATA = (
 )
 
 
-def module(jaxpr: Any, batched: Sequence[bool], number: int) -> tuple[str, str]:
+def module(functions: Sequence[str], main: str, inputs: int, outputs: int) -> tuple[str, str]:
     """The name of a kernel, which depends on all that it computes, and its LLVM module.
 
     Args:
+        functions: in LLVM, of any names.
+        main: the name of the one that XLA calls; it takes pointers to all inputs, then to all outputs.
+        inputs: their number.
+        outputs: their number.
+    """
+    text = "\n".join([*DECLARATIONS, *functions, _handler(main, inputs, outputs), *LOOP_METADATA])
+    name = f"flytune_{hashlib.sha256(text.encode()).hexdigest()[:24]}"
+    return name, text.replace("@KERNEL", f"@{name}")
+
+
+def function(name: str, inputs: int, outputs: int, body: Sequence[str]) -> str:
+    """A function in LLVM of pointers %in0, ... and %out0, ..., which do not overlap."""
+    arguments = ", ".join(f"ptr noalias {buffer}" for buffer in _buffers(inputs, outputs))
+    return "\n".join([f"define internal void @{name}({arguments}) noinline {{", *body, "  ret void", "}"])
+
+
+def _buffers(inputs: int, outputs: int) -> list[str]:
+    return [f"%in{index}" for index in range(inputs)] + [f"%out{index}" for index in range(outputs)]
+
+
+def loop(name: str, jaxpr: Any, batched: Sequence[bool], number: int) -> str:
+    """A function in LLVM that computes a jaxpr of one element for a batch.
+
+    Args:
+        name: of the function.
         jaxpr: closed, of one element.
         batched: of each input, whether it has a last axis of `number` elements; the others are the same for all.
         number: elements of the batch. Outputs are batched.
@@ -59,29 +87,20 @@ def module(jaxpr: Any, batched: Sequence[bool], number: int) -> tuple[str, str]:
         for index, (values, variable) in enumerate(zip(outputs, jaxpr.jaxpr.outvars, strict=True))
         for line in _stores(f"%out{index}", values, variable.aval, number)
     ]
-    buffers = [f"%in{index}" for index in range(len(inputs))] + [f"%out{index}" for index in range(len(outputs))]
-    body = "\n".join(
-        [
-            f"define internal void @NAME_loop({', '.join(f'ptr noalias {buffer}' for buffer in buffers)}) noinline {{",
-            "entry:",
-            *before.lines,
-            "  br label %loop",
-            "loop:",
-            "  %i = phi i64 [0, %entry], [%next, %loop]",
-            *emitter.lines,
-            *stores,
-            "  %next = add nuw nsw i64 %i, 1",
-            f"  %more = icmp ult i64 %next, {number}",
-            "  br i1 %more, label %loop, label %end, !llvm.loop !0",
-            "end:",
-            "  ret void",
-            "}",
-            *LOOP_METADATA,
-        ]
-    )
-    text = "\n".join([DECLARATIONS, body, handler(buffers)])
-    name = f"flytune_{hashlib.sha256(text.encode()).hexdigest()[:24]}"
-    return name, text.replace("NAME", name)
+    body = [
+        "entry:",
+        *before.lines,
+        "  br label %loop",
+        "loop:",
+        "  %i = phi i64 [0, %entry], [%next, %loop]",
+        *emitter.lines,
+        *stores,
+        "  %next = add nuw nsw i64 %i, 1",
+        f"  %more = icmp ult i64 %next, {number}",
+        "  br i1 %more, label %loop, label %end, !llvm.loop !0",
+        "end:",
+    ]
+    return function(name, len(inputs), len(outputs), body)
 
 
 def _memory_type(dtype: Any) -> str:
@@ -114,8 +133,9 @@ def _stores(buffer: str, values: Values, kind: Any, number: int) -> list[str]:
     return lines
 
 
-def handler(buffers: Sequence[str]) -> str:
-    """What XLA calls: it answers what version it is of, or takes the addresses of the buffers and runs the loop."""
+def _handler(main: str, inputs: int, outputs: int) -> str:
+    """What XLA calls: it answers what version it is of, or takes the addresses of the buffers and calls `main`."""
+    buffers = _buffers(inputs, outputs)
     counts = {"in": ARGUMENTS, "out": RESULTS}
     lines = []
     for kind, offset in counts.items():
@@ -134,7 +154,7 @@ def handler(buffers: Sequence[str]) -> str:
         ]
     return "\n".join(
         [
-            "define ptr @NAME(ptr %frame) {",
+            "define ptr @KERNEL(ptr %frame) {",
             f"  %ext_p = getelementptr i8, ptr %frame, i64 {EXTENSION}",
             "  %ext = load ptr, ptr %ext_p",
             "  %asks = icmp ne ptr %ext, null",
@@ -149,7 +169,7 @@ def handler(buffers: Sequence[str]) -> str:
             "  ret ptr null",
             "run:",
             *lines,
-            f"  call void @NAME_loop({', '.join(f'ptr {buffer}' for buffer in buffers)})",
+            f"  call void @{main}({', '.join(f'ptr {buffer}' for buffer in buffers)})",
             "  ret ptr null",
             "}",
         ]

@@ -13,6 +13,7 @@ import inspect
 import math
 import os
 import pickle
+import threading
 from collections.abc import Callable, Iterator, Sequence
 from importlib import metadata
 from pathlib import Path
@@ -30,6 +31,8 @@ from flytune.kernels.batched import SWITCH
 PACKAGES = ("jax", "jaxlib", "optax", "numpy", "llvmlite")  # whose versions are part of the name
 KNOWN = ("builtins", "flytune", *PACKAGES)
 SETTINGS = ("jax_enable_x64", "jax_default_matmul_precision", "jax_default_prng_impl", "jax_threefry_partitionable")
+
+_lock = threading.RLock()
 
 
 class Foreign(Exception):
@@ -70,14 +73,23 @@ def _program(function: Callable[..., Any], static: Sequence[str], donate: Sequen
         leaves, structure = jax.tree.flatten({name: value for name, value in values.items() if name not in fixed})
         if native.cache_folder() is None or any(isinstance(leaf, Tracer) for leaf in leaves):
             return usual(**values)
-        kinds = tuple(jax.api_util.shaped_abstractify(leaf) for leaf in leaves)
+        kinds = tuple([_kind(leaf) for leaf in leaves])
         key = (structure, kinds, tuple(fixed.values()))
         if key not in programs:
-            named = _place(function, structure, kinds, fixed)
-            programs[key] = usual if named is None else _load_or_compile(named, compiled, values, fixed)
+            with _lock:  # two threads would trace twice
+                if key not in programs:
+                    named = _place(function, structure, kinds, fixed)
+                    programs[key] = usual if named is None else _load_or_compile(named, compiled, values, fixed)
         return programs[key](**values)
 
     return call
+
+
+def _kind(leaf: Any) -> Any:
+    """What a program depends on of an array or a number."""
+    if isinstance(leaf, jax.Array):
+        return leaf.shape, leaf.dtype, leaf.weak_type
+    return jax.api_util.shaped_abstractify(leaf)
 
 
 def _place(function: Any, structure: Any, kinds: Sequence[Any], fixed: dict[str, Any]) -> Path | None:

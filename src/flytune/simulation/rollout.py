@@ -4,6 +4,7 @@ Training, evaluation in flytune's own simulator and the benchmarks all step thei
 loop, for simulators that JAX cannot look into and for trainers that want one step at a time.
 """
 
+import contextlib
 from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
@@ -14,7 +15,10 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
 from flytune.config.pytree import pytree
-from flytune.kernels.batched import batched
+from flytune.kernels.batched import available, batched
+from flytune.kernels.dense import Actor
+from flytune.kernels.emit import Unsupported
+from flytune.kernels.window import window
 from flytune.physics import dynamics
 from flytune.simulation import environment
 from flytune.simulation.environment import Episode, Physics
@@ -66,7 +70,8 @@ def rollout(
 
     Args:
         family: the task, or the family whose numbers each episode carries.
-        decide: (memory, observation [N, 17], Draw.controller, episodes) -> (memory, action [N, 4], notes).
+        decide: (memory, observation [N, 17], Draw.controller, episodes) -> (memory, action [N, 4], notes). With an
+            `Actor` all steps are one kernel where `inputs` are the keys of all steps.
         start: N episodes and the controller's memory.
         inputs: scanned over time [T, ...]; each slice goes to `draw`.
         ending: what follows a step, `environment.restart` or `environment.hold`.
@@ -115,7 +120,13 @@ def rollout(
     unpack = jax.vmap(restore, in_axes=-1, out_axes=-1)
     kept = jax.eval_shape(lambda: _kept_of_one(move, family, episodes, inputs, draw))
     restore_kept = ravel_pytree(jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), kept))[1]
-    (numbers, memory), steps = jax.lax.scan(advance, (pack(episodes), memory), inputs)
+    steps = None
+    if isinstance(decide, Actor) and available() and isinstance(inputs, Draw) and inputs.next_noise is None:
+        with contextlib.suppress(Unsupported):  # what has no form as a kernel says so below
+            numbers, packed = window(look, move_packed, family, decide, pack(episodes), inputs.noise, inputs.keys)
+            steps = Step((), None, packed)
+    if steps is None:
+        (numbers, memory), steps = jax.lax.scan(advance, (pack(episodes), memory), inputs)
     record_of_all = jax.vmap(jax.vmap(restore_kept, in_axes=-1, out_axes=-1))(steps.record)
     return (unpack(numbers), memory), steps._replace(record=record_of_all)
 

@@ -6,29 +6,32 @@ episode has no gradient; so each termination condition also adds a smooth barrie
 """
 
 import dataclasses
-from functools import partial
+import math
+from concurrent.futures import ThreadPoolExecutor
+from functools import lru_cache
 from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import optax
 import optax.contrib
 from jax.flatten_util import ravel_pytree
-from jax.sharding import NamedSharding, PartitionSpec
 from jaxtyping import Array, Float
 
 from flytune.config.pytree import pytree
 from flytune.control.policy import Network, Policy, make_network
-from flytune.kernels.dense import perceptron
+from flytune.kernels.batched import batched
+from flytune.kernels.dense import Actor
 from flytune.kernels.programs import program
 from flytune.simulation.environment import Episode, Outcome
 from flytune.simulation.rollout import Draw, reset_all, rollout
 from flytune.task.observation import SIZE, input_scale
 from flytune.task.task import Task
 from flytune.task.training_settings import ApgSettings
-from flytune.training.update import averaged, descend, metrics_of, rollout_sums
+from flytune.training.update import averaged, cores, descend, metrics_of, rollout_sums
 
-PARTS = 2  # of a batch, which are computed apart
+PARTS = 2  # of a batch, which two cores can compute at the same time
 
 
 @pytree
@@ -45,17 +48,12 @@ class TrainState:
 
 def policy(settings: ApgSettings, train_state: TrainState) -> Policy:
     """The policy that is flown: the averaged actor."""
-    return Policy(actor=_here(train_state.ema), input_scale=input_scale(settings.input_scale), squash="tanh")
+    return Policy(actor=train_state.ema, input_scale=input_scale(settings.input_scale), squash="tanh")
 
 
 def last_policy(settings: ApgSettings, train_state: TrainState) -> Policy:
     """The policy of the last update."""
-    return Policy(actor=_here(train_state.actor), input_scale=input_scale(settings.input_scale), squash="tanh")
-
-
-def _here(network: Network) -> Network:
-    """A network on JAX's default device, wherever it was."""
-    return jax.tree.map(jnp.asarray, jax.device_get(network))
+    return Policy(actor=train_state.actor, input_scale=input_scale(settings.input_scale), squash="tanh")
 
 
 def _optimiser(settings: ApgSettings) -> optax.GradientTransformation:
@@ -114,93 +112,66 @@ def warm_start(settings: ApgSettings, train_state: TrainState, policy: Policy) -
 def update(task: Task, settings: ApgSettings, train_state: TrainState) -> tuple[TrainState, dict[str, Any]]:
     """The training state after one update, and its metrics.
 
-    The batch is computed in two halves, one after the other or, where JAX has two devices, at the same time; the
-    numbers are the same bit by bit.
+    The batch is computed in two parts. On two cores they are computed at the same time; the numbers are the same bit
+    by bit.
     """
     number = PARTS if settings.environments % PARTS == 0 else 1
-    devices = tuple(jax.devices()[:number]) if jax.device_count() >= number > 1 else ()
-    if devices:
-        train_state = jax.device_put(train_state, _shardings(devices, train_state))
-    return _update(task, settings, number, devices, train_state)
+
+    def part(index: int) -> Any:
+        return jax.block_until_ready(
+            _part(task, settings, number, train_state.actor, train_state.episodes, train_state.key, np.int32(index))
+        )
+
+    parts = _threads().map(part, range(number)) if cores() > 1 else map(part, range(number))
+    return _descend(settings, train_state, tuple(parts))
 
 
-def _shardings(devices: tuple[Any, ...], train_state: TrainState) -> TrainState:
-    """Where each array of a training state is: a part of the episodes on each device, the rest on all."""
-    mesh = jax.make_mesh((len(devices),), ("part",), devices=devices)
-    everywhere, parts = NamedSharding(mesh, PartitionSpec()), _along_last(train_state.episodes)
-    shardings = jax.tree.map(lambda _: everywhere, train_state)
-    return dataclasses.replace(shardings, episodes=jax.tree.map(partial(NamedSharding, mesh), parts))
+@lru_cache
+def _threads() -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(PARTS, "flytune-apg")
 
 
-def _along_last(tree: Any) -> Any:
-    """How arrays are divided whose last axis is the batch."""
-    return jax.tree.map(lambda leaf: PartitionSpec(*[None] * (leaf.ndim - 1), "part"), tree)
-
-
-@program(static=["settings", "number", "devices"], donate=["train_state"])
-def _update(
-    task: Task, settings: ApgSettings, number: int, devices: tuple[Any, ...], train_state: TrainState
-) -> tuple[TrainState, dict[str, Any]]:
-    key, flight_key = jax.random.split(train_state.key)
-    noise_key, reset_key = jax.random.split(flight_key)
-    shape = (settings.window, settings.environments)
-    draws = Draw(noise=jax.random.split(noise_key, shape), keys=jax.random.split(reset_key, shape))
-    gradient, episodes, sums = _in_parts(
-        task, settings, number, devices, train_state.actor, train_state.episodes, draws
+@program(static=["settings", "number"])
+def _part(
+    task: Task, settings: ApgSettings, number: int, actor: Network, episodes: Episode, key: Array, index: Array
+) -> tuple[Network, Episode, dict[str, Any]]:
+    """The gradient of a part of the batch, its episodes after the window, and its sums for the metrics."""
+    width = settings.environments // number
+    mine = jax.tree.map(lambda leaf: jax.lax.dynamic_slice_in_dim(leaf, index * width, width, axis=-1), episodes)
+    noise, keys = (_keys(each, (settings.window, width)) for each in jax.random.split(jax.random.fold_in(key, index)))
+    (_, (after, sums)), gradient = jax.value_and_grad(_loss, argnums=2, has_aux=True)(
+        task, settings, actor, mine, Draw(noise=noise, keys=keys)
     )
+    return gradient, after, sums
+
+
+def _keys(key: Array, shape: tuple[int, int]) -> Array:
+    """Keys [time, environment] from a key."""
+
+    def one(key: Array, number: Array) -> Array:
+        return jax.random.key_data(jax.random.fold_in(jax.random.wrap_key_data(key), number))
+
+    words = batched(one, jax.random.key_data(key))(jnp.arange(math.prod(shape), dtype=jnp.uint32))
+    return jax.random.wrap_key_data(words.T).reshape(shape)
+
+
+@program(static=["settings"], donate=["train_state"])
+def _descend(settings: ApgSettings, train_state: TrainState, parts: tuple[Any, ...]) -> Any:
+    """The training state after a step against the mean gradient of all parts, and the metrics."""
+    gradients, episodes, sums = zip(*parts, strict=True)
+    gradient = jax.tree.map(lambda *leaves: sum(leaves[1:], start=leaves[0]) / len(leaves), *gradients)
+    total = jax.tree.map(lambda *leaves: sum(leaves[1:], start=leaves[0]), *sums)
     actor, optimiser = descend(_optimiser(settings), gradient, train_state.optimiser, train_state.actor)
     after = TrainState(
         actor=actor,
         ema=averaged(train_state.ema, actor, settings.ema_decay, train_state.updates),
         optimiser=optimiser,
-        episodes=episodes,
-        key=key,
+        episodes=jax.tree.map(lambda *leaves: jnp.concatenate(leaves, axis=-1), *episodes),
+        key=jax.random.fold_in(train_state.key, len(parts)),
         updates=train_state.updates + 1,
     )
-    measured = metrics_of(sums)
-    return after, {
-        **measured,
-        "objective": sums["objective"] / sums["steps"],
-        "gradient_norm": optax.tree.norm(gradient),
-    }
-
-
-def _in_parts(
-    task: Task,
-    settings: ApgSettings,
-    number: int,
-    devices: tuple[Any, ...],
-    actor: Network,
-    episodes: Episode,
-    draws: Draw,
-) -> tuple[Network, Episode, dict[str, Any]]:
-    """The gradient, the episodes after the window and the sums of `rollout_sums`, from parts of the batch."""
-
-    def part(actor: Network, episodes: Episode, draws: Draw) -> Any:
-        (_, (after, sums)), gradient = jax.value_and_grad(_loss, argnums=2, has_aux=True)(
-            task, settings, actor, episodes, draws
-        )
-        return (jax.tree.map(lambda leaf: leaf / number, gradient), sums), after
-
-    if devices:
-        mesh = jax.make_mesh((number,), ("part",), devices=devices)
-        divided = _along_last(episodes)
-        (gradient, sums), after = jax.shard_map(
-            lambda *given: (jax.lax.psum(part(*given)[0], "part"), part(*given)[1]),
-            mesh=mesh,
-            in_specs=(PartitionSpec(), divided, _along_last(draws)),
-            out_specs=(PartitionSpec(), divided),
-            check_vma=False,
-        )(actor, episodes, draws)
-        return gradient, after, sums
-    width = settings.environments // number
-    results = [
-        part(actor, *jax.tree.map(lambda leaf, low=low: leaf[..., low : low + width], (episodes, draws)))
-        for low in range(0, settings.environments, width)
-    ]
-    totals, afters = zip(*results, strict=True)
-    gradient, sums = jax.tree.map(lambda *leaves: sum(leaves[1:], start=leaves[0]), *totals)
-    return gradient, jax.tree.map(lambda *leaves: jnp.concatenate(leaves, axis=-1), *afters), sums
+    objective = total["objective"] / total["steps"]
+    return after, {**metrics_of(total), "objective": objective, "gradient_norm": optax.tree.norm(gradient)}
 
 
 def _loss(task: Task, settings: ApgSettings, actor: Network, episodes: Episode, draws: Draw) -> Any:
@@ -210,12 +181,11 @@ def _loss(task: Task, settings: ApgSettings, actor: Network, episodes: Episode, 
     scaled = dataclasses.replace(actor, weights=(first * input_scale(settings.input_scale)[:, None], *others))
     parameters, sizes = ravel_pytree(scaled)[0], actor.sizes
 
-    def decide(memory: Any, observation: Array, draw: Any, episodes: Episode) -> Any:
-        return memory, perceptron(parameters, sizes, observation.T, squash=True).T, ()
+    decide = Actor(parameters=parameters, sizes=sizes, squash=True)
 
     def record(after: Episode, moved: Episode, outcome: Outcome) -> Any:
         cost = sum((barrier(margin, settings) for margin in outcome.margins.values()), start=jnp.zeros(()))
-        return outcome.reward - cost, outcome, moved
+        return outcome.reward - cost, *jax.lax.stop_gradient((outcome, moved))
 
     (episodes, _), step = rollout(task, decide, (episodes, ()), draws, record=record, slack=settings.termination_slack)
     worth, outcome, moved = step.record

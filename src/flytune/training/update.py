@@ -2,6 +2,7 @@
 
 import ctypes
 import math
+import os
 import sys
 from typing import Any, TypeVar
 
@@ -35,6 +36,11 @@ def keep_freed_memory() -> None:
         mallopt(MMAP_THRESHOLD, 2**30)
         mallopt(TRIM_THRESHOLD, 2**31 - 1)
         mallopt(ARENA_MAX, 1)
+
+
+def cores() -> int:
+    """The number of processor cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def descend(optimiser: optax.GradientTransformation, gradient: T, memory: Any, parameters: T) -> tuple[T, Any]:
