@@ -1,6 +1,9 @@
 """Analytic policy gradient: the gradient is the true one, and following it flies."""
 
 import dataclasses
+import os
+import subprocess
+import sys
 
 import jax
 import jax.numpy as jnp
@@ -105,3 +108,29 @@ def test_apg_settles_the_trials_on_every_axis_without_a_crash(vehicle, updates, 
     settled = {axis: judgement.settled(axis) for axis in ("x", "y", "z", "yaw")}
     assert min(settled.values()) >= wanted, settled
     assert not judgement.crashed.any()
+
+
+SCRIPT = """
+import dataclasses, hashlib, os, sys
+if sys.argv[1] == "one":
+    os.sched_setaffinity(0, [min(os.sched_getaffinity(0))])
+import jax, numpy as np
+from flytune.task.task import load_task
+from flytune.training import apg
+task = load_task("baseline")
+settings = dataclasses.replace(task.apg, environments=6, window=20, hidden=(8, 8))
+state = apg.start(task, settings, jax.random.key(0))
+for _ in range(3):
+    state, metrics = apg.update(task, settings, state)
+leaves = jax.tree.leaves((state.actor, state.episodes, metrics))
+print(hashlib.sha256(b"".join(np.asarray(leaf).tobytes() for leaf in leaves)).hexdigest())
+"""
+
+
+@pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="this system cannot take cores from a process")
+def test_one_core_and_two_give_the_same_bits():
+    runs = [
+        subprocess.run([sys.executable, "-c", SCRIPT, cores], capture_output=True, text=True, check=True).stdout
+        for cores in ("one", "all")
+    ]
+    assert len(runs[0]) > 60 and runs[0] == runs[1]

@@ -88,7 +88,7 @@ def _program(function: Callable[..., Any], static: Sequence[str], donate: Sequen
 def _kind(leaf: Any) -> Any:
     """What a program depends on of an array or a number."""
     if isinstance(leaf, jax.Array):
-        return leaf.shape, leaf.dtype, leaf.weak_type
+        return leaf.shape, leaf.dtype, getattr(leaf, "weak_type", False)  # keys have none
     return jax.api_util.shaped_abstractify(leaf)
 
 
