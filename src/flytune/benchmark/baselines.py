@@ -143,21 +143,27 @@ def _missing(extras: Sequence[str]) -> str | None:
 
 
 def fastest(runs: Sequence[Repeat], clock: Callable[[], float] = time.perf_counter) -> list[float]:
-    """Seconds of the fastest repetition of each function; a first repetition, which compiles, does not count.
+    """Seconds of the fastest repetition of each function, see `repetitions`.
 
     Other load on the machine only ever makes a repetition slower.
     """
+    return [min(seconds) for seconds in repetitions(runs, clock)]
+
+
+def repetitions(runs: Sequence[Repeat], clock: Callable[[], float] = time.perf_counter) -> list[list[float]]:
+    """Seconds of each repetition of each function; a first repetition, which compiles, does not count."""
     for run in runs:
         run()
-    best, began = [float("inf")] * len(runs), clock()
+    seconds: list[list[float]] = [[] for _ in runs]
+    began = clock()
     for number in range(ROUNDS):
         if number and clock() - began > LONGEST:
             break
         for index, run in enumerate(runs):
             started = clock()
             run()
-            best[index] = min(best[index], clock() - started)
-    return best
+            seconds[index].append(clock() - started)
+    return seconds
 
 
 def make_environment(task: Task) -> Any:

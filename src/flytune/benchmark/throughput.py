@@ -3,6 +3,7 @@
 import dataclasses
 import itertools
 import os
+import statistics
 from collections.abc import Callable
 from typing import Any
 
@@ -10,12 +11,14 @@ import jax
 import jax.numpy as jnp
 
 from flytune.benchmark import baselines
-from flytune.benchmark.baselines import Measurement, fastest
+from flytune.benchmark.baselines import Measurement, fastest, repetitions
+from flytune.benchmark.requirement import TimeToRequirement, time_to_requirement
 from flytune.errors import BadInput
 from flytune.simulation.environment import Episode
 from flytune.simulation.rollout import Draw, reset_all, rollout
+from flytune.task.observation import SIZE
 from flytune.task.task import Task, load_task
-from flytune.task.training_settings import PpoSettings
+from flytune.task.training_settings import PpoSettings, TrainerSettings
 from flytune.training.trainer import TRAINERS, Trainer
 
 BATCH, WIDTH = 128, 64  # of the matrix product everything is compared with: 128 x 64 times 64 x 64, float32
@@ -31,7 +34,10 @@ class Throughput:
     ppo: float | None
     ppo_share_of_limit: float | None  # of what the matrix product alone would allow
     apg: float | None
+    apg_share_of_limit: float | None
     simulate: float | None
+    spread: dict[str, float]  # of each rate: how far the median of the repetitions lies below the best, as a share
+    requirement: TimeToRequirement | None  # None where not measured
     training: list[Measurement] | None  # beside Stable-Baselines3 and PyBullet
     simulation: list[Measurement] | None
     device: str
@@ -52,11 +58,21 @@ class Throughput:
                 f"train ppo (128 environments x 128 steps)   {self.ppo:10,.0f} steps/s   "
                 f"{self.ppo_share_of_limit:.2f} of the product's limit"
             )
-        others = {
-            "train apg (forward and backward)": self.apg,
-            "simulate (observe, step, reward, reset)": self.simulate,
-        }
-        lines += [f"{what:42} {rate:10,.0f} steps/s" for what, rate in others.items() if rate is not None]
+        if self.apg is not None and self.apg_share_of_limit is not None:
+            lines.append(
+                f"train apg (forward and backward)           {self.apg:10,.0f} steps/s   "
+                f"{self.apg_share_of_limit:.2f} of the product's limit"
+            )
+        if self.simulate is not None:
+            lines.append(f"simulate (observe, step, reward, reset)    {self.simulate:10,.0f} steps/s")
+        lines += [f"the median of {what} is {share:.0%} below the best" for what, share in self.spread.items()]
+        if self.requirement is not None:
+            each = self.requirement
+            warm = ", ".join(f"{seconds:.1f}" for seconds in each.warm)
+            lines.append(
+                f"train baseline, the whole command: cold {each.cold:.1f} s, warm {warm} s, {each.memory:,.0f} MiB, "
+                f"requirement {'met' if each.met else 'not met'}"
+            )
         for title, measurements in (("training", self.training), ("simulation", self.simulation)):
             if measurements is not None:
                 heading = f"{title} (steps of each environment; ratio to the first row)"
@@ -79,14 +95,26 @@ def bench(what: str = "all") -> Throughput:
     training, simulation = what in ("all", "train"), what in ("all", "simulate")
     product = _matrix_product()
     ppo_update, fly = _training(TRAINERS["ppo"], task), _simulation(task)
-    ppo_rate = task.ppo.steps_per_update / _seconds(ppo_update) if training else None
+    spread: dict[str, float] = {}
+
+    def rate(what: str, steps: int, run: Callable[[], Any]) -> float:
+        (seconds,) = repetitions([run])
+        spread[what] = 1 - min(seconds) / statistics.median(seconds)
+        return steps / min(seconds)
+
+    ppo_rate = rate("ppo", task.ppo.steps_per_update, ppo_update) if training else None
+    apg_rate = rate("apg", task.apg.steps_per_update, _training(TRAINERS["apg"], task)) if training else None
+    simulated = rate("simulate", SIMULATED[0] * SIMULATED[1], fly) if simulation else None
     product = max(product, _matrix_product())  # the better of two, as other load disturbs it
     return Throughput(
         matrix_product=product,
         ppo=ppo_rate,
         ppo_share_of_limit=ppo_rate * operations_per_step(task.ppo) / product if ppo_rate else None,
-        apg=task.apg.steps_per_update / _seconds(_training(TRAINERS["apg"], task)) if training else None,
-        simulate=SIMULATED[0] * SIMULATED[1] / _seconds(fly) if simulation else None,
+        apg=apg_rate,
+        apg_share_of_limit=apg_rate * 3 * operations_of_actor(task.apg) / product if apg_rate else None,
+        simulate=simulated,
+        spread=spread,
+        requirement=time_to_requirement() if training else None,
         training=baselines.compare_training(task, ppo_update) if training else None,
         simulation=baselines.compare_simulation(task, fly, SIMULATED) if simulation else None,
         device=jax.devices()[0].platform,
@@ -100,10 +128,14 @@ def operations_per_step(settings: PpoSettings) -> float:
     Each epoch runs actor and critic forward and backward (3 times forward), the rollout runs the actor once and the
     critic twice (before and after the step); a multiplication and its addition count as two.
     """
-    sizes = (17, *settings.hidden)
-    trunk = sum(a * b for a, b in itertools.pairwise(sizes))
-    actor, critic = trunk + 4 * sizes[-1], trunk + sizes[-1]
-    return 2.0 * (3 * settings.epochs * (actor + critic) + actor + 2 * critic)
+    actor = operations_of_actor(settings)
+    critic = actor - 2.0 * 3 * settings.hidden[-1]
+    return 3 * settings.epochs * (actor + critic) + actor + 2 * critic
+
+
+def operations_of_actor(settings: TrainerSettings) -> float:
+    """Floating-point operations of one action, products alone; its gradient takes twice as many again."""
+    return 2.0 * sum(fewer * more for fewer, more in itertools.pairwise((SIZE, *settings.hidden, 4)))
 
 
 def _seconds(run: Callable[[], Any]) -> float:

@@ -120,15 +120,17 @@ def rollout(
     unpack = jax.vmap(restore, in_axes=-1, out_axes=-1)
     kept = jax.eval_shape(lambda: _kept_of_one(move, family, episodes, inputs, draw))
     restore_kept = ravel_pytree(jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), kept))[1]
-    steps = None
-    if isinstance(decide, Actor) and available() and isinstance(inputs, Draw) and inputs.next_noise is None:
-        with contextlib.suppress(Unsupported):  # what has no form as a kernel says so below
-            numbers, packed = window(look, move_packed, family, decide, pack(episodes), inputs.noise, inputs.keys)
-            steps = Step((), None, packed)
-    if steps is None:
-        (numbers, memory), steps = jax.lax.scan(advance, (pack(episodes), memory), inputs)
+
+    def fly() -> tuple[tuple[Array, Memory], Step]:
+        if isinstance(decide, Actor) and available() and isinstance(inputs, Draw) and inputs.next_noise is None:
+            with contextlib.suppress(Unsupported):  # what has no form as a kernel says so below
+                numbers, packed = window(look, move_packed, family, decide, pack(episodes), inputs.noise, inputs.keys)
+                return (numbers, memory), Step((), None, packed)
+        return jax.lax.scan(advance, (pack(episodes), memory), inputs)
+
+    (numbers, memory_after), steps = fly()
     record_of_all = jax.vmap(jax.vmap(restore_kept, in_axes=-1, out_axes=-1))(steps.record)
-    return (unpack(numbers), memory), steps._replace(record=record_of_all)
+    return (unpack(numbers), memory_after), steps._replace(record=record_of_all)
 
 
 def _kept_of_one(move: Callable[..., Any], family: TaskFamily, episodes: Episode, inputs: Any, draw: Any) -> Any:

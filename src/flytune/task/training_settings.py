@@ -117,12 +117,12 @@ class ApgSettings:
     environments: Count = 64
     window: Annotated[Whole, Ge(1), Le(1_000_000), Unit("steps")] = 250  # of each episode in one gradient
     learning_rate: Annotated[Real, Gt(0), Unit("1")] = 5e-3  # of the biases, by Adam
-    muon_factor: Annotated[Real, Ge(0), Unit("1")] = 12.0  # by Muon, the weights learn at this multiple; 0: by Adam too
+    muon_factor: Annotated[Real, Ge(0), Unit("1")] = 16.0  # by Muon, the weights learn at this multiple; 0: by Adam too
     final_learning_rate: Share = 0.02  # as a share of the first, reached by a cosine
     adam_b1: Annotated[Real, Ge(0), Lt(1), Unit("1")] = 0.7  # Adam's b1
     adam_b2: Annotated[Real, Ge(0), Lt(1), Unit("1")] = 0.95  # Adam's b2
     max_grad_norm: Annotated[Real, Gt(0), Unit("1")] = 1.0
-    barrier_weight: Annotated[Real, Ge(0), Unit("1")] = 30.0
+    barrier_weight: Annotated[Real, Ge(0), Unit("1")] = 45.0
     barrier_margin: Annotated[Real, Ge(0), Lt(1), Unit("1")] = 0.1  # the barrier begins below this margin
     termination_slack: Annotated[Real, Ge(0), Unit("1")] = 0.0  # share of a bound; beyond it by more, an episode ends
     input_scale: tuple[Positive, Positive, Positive, Positive, Positive] = (2.0, 3.0, 2.0, 0.3, 1.0)  # per block of R7
