@@ -18,7 +18,7 @@ from flytune.config.pytree import pytree, static
 from flytune.kernels import elementary
 from flytune.kernels.batched import available
 from flytune.kernels.emit import Emitter
-from flytune.kernels.native import function, module, register, vector_width
+from flytune.kernels.native import function, module, register, vector_width, vectorised
 
 ZERO = "0.0"
 ROWS = 6  # of a tile of a product; with two vectors of columns it fills the registers of AVX2
@@ -294,7 +294,7 @@ class Writer:
             self._lines += emitter.lines
             self._store(str(result[()]), self.at(out, index))
 
-        self.each(number, body, ", !llvm.loop !0")
+        self.each(number, body, vectorised(number))
 
     def transpose(self, source: str, out: str, rows: int, columns: int) -> None:
         """out[n, m] = source[m, n]."""

@@ -60,6 +60,11 @@ def function(name: str, inputs: int, outputs: int, body: Sequence[str]) -> str:
     return "\n".join([f"define internal void @{name}({arguments}) noinline {{", *body, "  ret void", "}"])
 
 
+def vectorised(number: int) -> str:
+    """What a branch back to the start of a loop carries so that LLVM computes many elements at once."""
+    return ", !llvm.loop !0" if number >= WIDTH else ""  # of fewer elements, LLVM would say that it does not
+
+
 def _buffers(inputs: int, outputs: int) -> list[str]:
     return [f"%in{index}" for index in range(inputs)] + [f"%out{index}" for index in range(outputs)]
 
@@ -97,7 +102,7 @@ def loop(name: str, jaxpr: Any, batched: Sequence[bool], number: int) -> str:
         *stores,
         "  %next = add nuw nsw i64 %i, 1",
         f"  %more = icmp ult i64 %next, {number}",
-        "  br i1 %more, label %loop, label %end, !llvm.loop !0",
+        f"  br i1 %more, label %loop, label %end{vectorised(number)}",
         "end:",
     ]
     return function(name, len(inputs), len(outputs), body)
