@@ -13,7 +13,7 @@ import jax, jax.numpy as jnp, numpy as np
 traced = []
 def listen(event, seconds, **facts):
     name = facts.get("fun_name", "").removeprefix("kept_")
-    if event == "/jax/core/compile/jaxpr_trace_duration" and name in ("start", "update"):
+    if event == "/jax/core/compile/jaxpr_trace_duration" and name in ("start", "_part", "_descend"):
         traced.append(name)
 jax.monitoring.register_event_duration_secs_listener(listen)
 from flytune.task.task import load_task
@@ -57,26 +57,27 @@ def first(tmp_path_factory):
 
 def test_a_second_process_traces_nothing_and_gives_the_same(first):
     folder, (traced, weights) = first
-    assert sorted(traced) == ["start", "update"]
+    assert sorted(traced) == ["_descend", "_part", "start"]
     assert run(folder) == [[], weights]
 
 
-def test_another_seed_and_other_numbers_of_the_task_use_the_same_program(first):
+def test_another_seed_other_numbers_of_the_task_and_another_vehicle_use_the_same_program(first):
     folder, (_, weights) = first
-    for change in ({"seed": 1}, {"edits": '{"reward.velocity.weight": 0.3}'}):
+    edits = '{"reward.velocity.weight": 0.3}', '{"vehicle": "crazyflie-measured"}'
+    for change in ({"seed": 1}, *({"edits": each} for each in edits)):
         traced, others = run(folder, **change)
         assert traced == [] and others != weights
 
 
 def test_another_structure_of_the_task_is_another_program(first):
     folder, _ = first
-    assert "update" in run(folder, extra=FEWER)[0]
+    assert "_part" in run(folder, extra=FEWER)[0]
 
 
 def test_code_of_a_user_is_traced_in_every_process(first):
     folder, _ = first
-    assert "update" in run(folder, extra=OWN)[0]
-    assert "update" in run(folder, extra=OWN)[0]
+    assert "_part" in run(folder, extra=OWN)[0]
+    assert "_part" in run(folder, extra=OWN)[0]
 
 
 def test_a_damaged_file_is_made_again(first):
@@ -86,7 +87,7 @@ def test_a_damaged_file_is_made_again(first):
         content[len(content) // 2] ^= 1
         place.write_bytes(content)
     traced, found = run(folder)
-    assert sorted(traced) == ["start", "update"] and found == weights
+    assert sorted(traced) == ["_descend", "_part", "start"] and found == weights
     assert run(folder) == [[], weights]
 
 

@@ -98,7 +98,7 @@ def test_the_average_is_the_mean_of_the_first_weights(small_task):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("vehicle", "updates", "wanted"), [("crazyflie", 300, 99), ("crazyflie-measured", 600, 95)])
+@pytest.mark.parametrize(("vehicle", "updates", "wanted"), [("crazyflie", 200, 99), ("crazyflie-measured", 400, 95)])
 def test_apg_settles_the_trials_on_every_axis_without_a_crash(vehicle, updates, wanted):
     task = load_task("baseline", {"vehicle": vehicle, "apg.updates": updates})
     train_state = apg.start(task, task.apg, jax.random.key(0))
