@@ -51,6 +51,16 @@ def reset_all(family: TaskFamily, keys: Array) -> Episode:
     return jax.vmap(partial(environment.reset, family), out_axes=-1)(keys)
 
 
+def split_keys(key: Array, steps: int, number: int) -> Array:
+    """Keys [steps, number] from a key; many times faster on a CPU than `jax.random.split`, which gives others."""
+
+    def one(key: Array, index: Array) -> Array:
+        return jax.random.key_data(jax.random.fold_in(jax.random.wrap_key_data(key), index))
+
+    words = batched(one, jax.random.key_data(key))(jnp.arange(steps * number, dtype=jnp.uint32))
+    return jax.random.wrap_key_data(words.T).reshape(steps, number)
+
+
 def rollout(
     family: TaskFamily,
     decide: Callable[[Memory, Float[Array, "N 17"], Any, Episode], tuple[Memory, Float[Array, "N 4"], Any]],

@@ -6,7 +6,6 @@ episode has no gradient; so each termination condition also adds a smooth barrie
 """
 
 import dataclasses
-import math
 from concurrent.futures import ThreadPoolExecutor
 from functools import lru_cache
 from typing import Any
@@ -21,11 +20,10 @@ from jaxtyping import Array, Float
 
 from flytune.config.pytree import pytree
 from flytune.control.policy import Network, Policy, make_network
-from flytune.kernels.batched import batched
 from flytune.kernels.dense import Actor
 from flytune.kernels.programs import program
 from flytune.simulation.environment import Episode, Outcome
-from flytune.simulation.rollout import Draw, reset_all, rollout
+from flytune.simulation.rollout import Draw, reset_all, rollout, split_keys
 from flytune.task.observation import SIZE, input_scale
 from flytune.task.task import Task
 from flytune.task.training_settings import ApgSettings
@@ -138,21 +136,13 @@ def _part(
     """The gradient of a part of the batch, its episodes after the window, and its sums for the metrics."""
     width = settings.environments // number
     mine = jax.tree.map(lambda leaf: jax.lax.dynamic_slice_in_dim(leaf, index * width, width, axis=-1), episodes)
-    noise, keys = (_keys(each, (settings.window, width)) for each in jax.random.split(jax.random.fold_in(key, index)))
+    noise, keys = (
+        split_keys(each, settings.window, width) for each in jax.random.split(jax.random.fold_in(key, index))
+    )
     (_, (after, sums)), gradient = jax.value_and_grad(_loss, argnums=2, has_aux=True)(
         task, settings, actor, mine, Draw(noise=noise, keys=keys)
     )
     return gradient, after, sums
-
-
-def _keys(key: Array, shape: tuple[int, int]) -> Array:
-    """Keys [time, environment] from a key."""
-
-    def one(key: Array, number: Array) -> Array:
-        return jax.random.key_data(jax.random.fold_in(jax.random.wrap_key_data(key), number))
-
-    words = batched(one, jax.random.key_data(key))(jnp.arange(math.prod(shape), dtype=jnp.uint32))
-    return jax.random.wrap_key_data(words.T).reshape(shape)
 
 
 @program(static=["settings"], donate=["train_state"])
