@@ -285,9 +285,9 @@ def _place(name: str) -> Path | None:
 
 
 def cache_folder() -> Path | None:
-    """Where JAX keeps compiled programs, None where it keeps none."""
+    """Where JAX keeps compiled programs, None where it keeps none on this machine."""
     folder: str | None = jax.config.jax_compilation_cache_dir  # pyright: ignore[reportAttributeAccessIssue]
-    return None if folder is None else Path(folder)
+    return None if folder is None or "://" in folder else Path(folder)
 
 
 def kept(place: Path) -> bytes | None:

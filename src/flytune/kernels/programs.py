@@ -71,10 +71,10 @@ def _program(function: Callable[..., Any], static: Sequence[str], donate: Sequen
         values = bound.arguments
         fixed = {name: values[name] for name in static}
         leaves, structure = jax.tree.flatten({name: value for name, value in values.items() if name not in fixed})
-        if native.cache_folder() is None or any(isinstance(leaf, Tracer) for leaf in leaves):
+        if native.cache_folder() is None or _looked_into() or any(isinstance(leaf, Tracer) for leaf in leaves):
             return usual(**values)
         kinds = tuple([_kind(leaf) for leaf in leaves])
-        key = (structure, kinds, tuple(fixed.values()))
+        key = (structure, kinds, tuple(fixed.values()), _settings())
         if key not in programs:
             with _lock:  # two threads would trace twice
                 if key not in programs:
@@ -99,8 +99,18 @@ def _place(function: Any, structure: Any, kinds: Sequence[Any], fixed: dict[str,
         described = [_name(function), list(_nodes(structure)), [str(kind) for kind in kinds], _static(fixed)]
     except Foreign:
         return None
-    text = repr([described, _surroundings()])
+    text = repr([described, _surroundings(), _settings()])
     return folder / f"program-{hashlib.sha256(text.encode()).hexdigest()[:40]}"
+
+
+def _settings() -> tuple[str, ...]:
+    """The settings of JAX that a trace depends on."""
+    return tuple(str(getattr(jax.config, name)) for name in SETTINGS)
+
+
+def _looked_into() -> bool:
+    """Whether JAX is told to run functions in a way that shows what happens in them."""
+    return any(getattr(jax.config, name) for name in ("jax_disable_jit", "jax_debug_nans", "jax_debug_infs"))
 
 
 def _load_or_compile(place: Path, compiled: Any, values: dict[str, Any], fixed: dict[str, Any]) -> Callable[..., Any]:
@@ -178,13 +188,12 @@ def _name(thing: Any) -> str:
 
 @functools.cache
 def _surroundings() -> list[str]:
-    """What programs depend on beside their arguments: code, versions, processor and settings."""
+    """What programs depend on beside their arguments and the settings of JAX: code, versions, processor, flags."""
     code = hashlib.sha256()
     folder = Path(__file__).parents[1]
     for path in sorted(folder.rglob("*.py")):
         code.update(f"{path.relative_to(folder)}\n".encode() + path.read_bytes())
     versions = [metadata.version(package) for package in PACKAGES]
     devices = [f"{device.platform} {device.device_kind}" for device in jax.devices()]
-    settings = [str(getattr(jax.config, name)) for name in SETTINGS]
     variables = [os.environ.get(name, "") for name in ("XLA_FLAGS", SWITCH)]
-    return [code.hexdigest(), *versions, *devices, *settings, *variables, native.processor()]
+    return [code.hexdigest(), *versions, *devices, *variables, native.processor()]
