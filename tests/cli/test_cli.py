@@ -189,8 +189,7 @@ def test_ctrl_c_saves_a_checkpoint_exits_with_130_and_resumes_to_the_same_policy
 def test_bench_prints_one_json_object_of_rates(folder):
     rates = json.loads(flytune("bench", "--json", cwd=folder, timeout=1200).stdout)
     assert rates["ppo"] > 0 and rates["apg"] > 0 and rates["simulate"] > 0
-    assert 0 < rates["ppo_share_of_limit"] < 1.2 and 0 < rates["apg_share_of_limit"] < 1.2
     assert rates["spread"].keys() == {"ppo", "apg", "simulate"}
     assert rates["requirement"]["met"] and len(rates["requirement"]["warm"]) == 3
-    assert 0 < rates["ppo_share_of_limit"] < 1.5
+    assert 0 < rates["ppo_share_of_limit"] < 1.5 and 0 < rates["apg_share_of_limit"] < 1.5
     assert all(row["steps_per_second"] or row["missing"] for row in rates["training"] + rates["simulation"])
