@@ -116,7 +116,7 @@ def test_an_iteration_that_diverges_is_not_edited_further(tmp_path):
         range=(1e-4, 1e25), reason="it is stiffer", source="test",
     )  # fmt: skip
     said = []
-    arguments = {"task": str(tmp_path / "stiff.toml"), "edits": {"apg.updates": 2}, "most_iterations": 3}
+    arguments = {"task": str(tmp_path / "stiff.toml"), "edits": {"apg.updates": 1}, "most_iterations": 3}
     result = tune(2.0, rules=[rule], out=tmp_path / "t", on_message=said.append, **arguments)
     assert [bool(each.diverged) for each in result.iterations] == [False, True]
     assert any(line.startswith("iteration 1   diverged: training: ") for line in said)

@@ -39,7 +39,7 @@ def test_a_task_without_a_known_policy_is_trained_from_new_weights():
     start = find_start(make_requirement(3), "baseline", {}, "apg")
     assert (start.name, start.files) == ("baseline", None)
     # the first training uses the settings of the task, a warm start those of the tuning
-    assert (start.first.apg.updates, start.task.apg.updates) == (300, 200)
+    assert (start.first.apg.learning_rate, start.task.apg.learning_rate) == (0.005, 0.002)
 
 
 def test_a_known_policy_with_other_layers_than_the_user_wants_is_not_used():

@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 import optax.contrib
+from jax.core import Tracer
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
@@ -120,7 +121,8 @@ def update(task: Task, settings: ApgSettings, train_state: TrainState) -> tuple[
             _part(task, settings, number, train_state.actor, train_state.episodes, train_state.key, np.int32(index))
         )
 
-    parts = _threads().map(part, range(number)) if cores() > 1 else map(part, range(number))
+    traced = isinstance(train_state.updates, Tracer)  # a thread of its own would not know of the trace
+    parts = _threads().map(part, range(number)) if cores() > 1 and not traced else map(part, range(number))
     return _descend(settings, train_state, tuple(parts))
 
 
