@@ -74,6 +74,7 @@ def test_another_structure_of_the_task_is_another_program(first):
     assert "_part" in run(folder, extra=FEWER)[0]
 
 
+@pytest.mark.slow
 def test_code_of_a_user_is_traced_in_every_process(first):
     folder, _ = first
     assert "_part" in run(folder, extra=OWN)[0]
@@ -91,6 +92,7 @@ def test_a_damaged_file_is_made_again(first):
     assert run(folder) == [[], weights]
 
 
+@pytest.mark.slow
 def test_a_missing_kernel_is_made_again(first):
     folder, (_, weights) = first
     for place in folder.glob("*.o"):
