@@ -1,5 +1,6 @@
 """The command line: it parses the options, calls the library and prints. Only a command that needs JAX imports it."""
 
+import gc
 import os
 import sys
 from collections.abc import Sequence
@@ -47,6 +48,7 @@ def make_app() -> App:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """The exit code of one command: 0 done, 2 bad input, 3 diverged, 4 requirement not met, 130 interrupted."""
+    gc.set_threshold(100_000, 50, 100)  # the default looks for garbage so often that it costs half a second
     _prepare_jax()
     try:
         command, bound, _ = _parse(sys.argv[1:] if arguments is None else arguments)
