@@ -13,6 +13,7 @@ import inspect
 import math
 import os
 import pickle
+import sys
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from importlib import metadata
@@ -44,6 +45,8 @@ def program(
 ) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
     """A decorator: the function as `jax.jit` compiles it, kept on disk where JAX has a folder for compiled programs.
 
+    Programs are kept for a CPU that is JAX's only device.
+
     A function that meets code outside flytune, for instance a reward term of a user, is compiled as usual.
 
     Args:
@@ -71,7 +74,7 @@ def _program(function: Callable[..., Any], static: Sequence[str], donate: Sequen
         values = bound.arguments
         fixed = {name: values[name] for name in static}
         leaves, structure = jax.tree.flatten({name: value for name, value in values.items() if name not in fixed})
-        if native.cache_folder() is None or _looked_into() or any(isinstance(leaf, Tracer) for leaf in leaves):
+        if not _possible() or any(isinstance(leaf, Tracer) for leaf in leaves):
             return usual(**values)
         kinds = tuple([_kind(leaf) for leaf in leaves])
         key = (structure, kinds, tuple(fixed.values()), _settings())
@@ -108,9 +111,10 @@ def _settings() -> tuple[str, ...]:
     return tuple(str(getattr(jax.config, name)) for name in SETTINGS)
 
 
-def _looked_into() -> bool:
-    """Whether JAX is told to run functions in a way that shows what happens in them."""
-    return any(getattr(jax.config, name) for name in ("jax_disable_jit", "jax_debug_nans", "jax_debug_infs"))
+def _possible() -> bool:
+    """Whether programs are kept: for a CPU as the only device, and not where JAX shows what happens in a function."""
+    shown = any(getattr(jax.config, name) for name in ("jax_disable_jit", "jax_debug_nans", "jax_debug_infs"))
+    return native.cache_folder() is not None and not shown and [each.platform for each in jax.devices()] == ["cpu"]
 
 
 def _load_or_compile(place: Path, compiled: Any, values: dict[str, Any], fixed: dict[str, Any]) -> Callable[..., Any]:
@@ -193,7 +197,7 @@ def _surroundings() -> list[str]:
     folder = Path(__file__).parents[1]
     for path in sorted(folder.rglob("*.py")):
         code.update(f"{path.relative_to(folder)}\n".encode() + path.read_bytes())
-    versions = [metadata.version(package) for package in PACKAGES]
+    versions = [sys.version, *(metadata.version(package) for package in PACKAGES)]
     devices = [f"{device.platform} {device.device_kind}" for device in jax.devices()]
     variables = [os.environ.get(name, "") for name in ("XLA_FLAGS", SWITCH)]
     return [code.hexdigest(), *versions, *devices, *variables, native.processor()]
