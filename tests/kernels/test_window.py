@@ -24,7 +24,7 @@ def flown(task, decide, episodes):
     """The episodes at the end, and rewards and what ended them at every step."""
     noise, keys = (jax.random.split(jax.random.key(seed), (STEPS, NUMBER)) for seed in (1, 2))
 
-    def record(after, moved, outcome):
+    def record(task, after, moved, outcome):
         return outcome.reward, jax.lax.stop_gradient((outcome.cause, outcome.truncated, after.steps))
 
     (after, _), step = rollout(task, decide, (episodes, ()), Draw(noise=noise, keys=keys), record=record)

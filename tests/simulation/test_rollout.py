@@ -48,9 +48,7 @@ def flown():
 
         count = jnp.zeros(NUMBER, jnp.int32)
         begun = (reset_all(family, jax.random.split(start, NUMBER)), count)
-        return rollout(
-            family, decide, begun, draws, fresh_memory=count, record=lambda after, moved, outcome: (moved, outcome)
-        )
+        return rollout(family, decide, begun, draws, fresh_memory=count, record=lambda task, after, *rest: rest)
 
     return run(family, jax.random.key(0))
 
@@ -99,7 +97,7 @@ def test_a_crashed_vehicle_is_held_and_the_others_fly_on():
         def decide(memory, observation, drawn, episodes):
             return memory, jnp.full((8, 4), -1.0), ()
 
-        return rollout(task, decide, begun, draws, ending=hold, record=lambda after, moved, outcome: after)
+        return rollout(task, decide, begun, draws, ending=hold, record=lambda task, after, moved, outcome: after)
 
     (episodes, _), step = run(far, jax.random.key(1))
     held = np.asarray(episodes.steps) < 0

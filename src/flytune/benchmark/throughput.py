@@ -182,7 +182,9 @@ def _simulation(task: Task) -> Callable[[], Any]:
             noise=jax.random.split(noise_key, (steps, environments)),
             keys=jax.random.split(reset_key, (steps, environments)),
         )
-        record = rollout(task, decide, (episodes, ()), draws, record=lambda after, moved, outcome: outcome.reward)[1]
+        record = rollout(
+            task, decide, (episodes, ()), draws, record=lambda task, after, moved, outcome: outcome.reward
+        )[1]
         return record.record.mean()
 
     return lambda: jax.block_until_ready(fly(episodes, jnp.asarray(jax.random.key(1))))

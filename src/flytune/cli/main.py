@@ -9,7 +9,7 @@ from pathlib import Path
 from cyclopts import App, CycloptsError, Parameter
 
 import flytune
-from flytune.cli import bench, evaluate, export, reproduce, rules, show, train, tune
+from flytune.cli import bench, evaluate, export, reproduce, response_map, rules, show, train, tune
 from flytune.cli.refusal import refusal
 from flytune.errors import BadInput, FlytuneError
 
@@ -19,6 +19,7 @@ COMMANDS = (
     evaluate.evaluate,
     evaluate.compare,
     evaluate.report,
+    response_map.response_map,
     tune.tune,
     rules.rules,
     reproduce.reproduce,
@@ -42,7 +43,8 @@ def make_app() -> App:
         default_parameter=Parameter(allow_repeating=True),
     )
     for number, command in enumerate(COMMANDS):
-        app.command(command, sort_key=number, help_epilogue="")
+        name = "map" if command is response_map.response_map else None  # a name that Python has taken
+        app.command(command, name=name, sort_key=number, help_epilogue="")
     return app
 
 

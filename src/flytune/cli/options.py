@@ -12,10 +12,11 @@ from flytune.config.files import check_file
 from flytune.errors import BadInput
 from flytune.training.trainer import trainer_names
 
-TASK_HELP = "a preset (baseline, acrobatic, inspection, or one of them with -refined), or a TOML file"
+TASK_HELP = "a preset (baseline, acrobatic, inspection, or one of them with -refined; dial), or a TOML file"
 CONTROLLER_HELP = (
     "a run directory, a policy file (.safetensors, .onnx, or a .zip of Stable-Baselines3), a policy that ships "
-    "(baseline-refined, or baseline-refined@ppo), or pid, geometric, lqr (with @textbook: gains that were not tuned)"
+    "(baseline-refined, or baseline-refined@ppo), or pid, geometric, lqr (with @textbook: gains that were not tuned); "
+    "a policy with a dial may be followed by its setting (dial@speed=0.5)"
 )
 
 
@@ -84,9 +85,20 @@ class FlightOptions:
         ),
     ] = "clear"
 
+    dial: Annotated[
+        Assignments,
+        Parameter(
+            name="--dial",
+            metavar="NAME=VALUE",
+            help="set the dials of a policy: speed=0.5; or turn them in flight, at times in seconds: "
+            "'speed=[[0, 0.3], [5, 1.0]]'",
+        ),
+    ] = ()
+
     def settings(self) -> dict[str, Any]:
         """The keyword arguments of `flytune.evaluate`."""
-        return vars(self) | {"simulator_options": assignments(self.simulator_options)}
+        read = {name: assignments(getattr(self, name)) for name in ("simulator_options", "dial")}
+        return vars(self) | read
 
 
 FLIGHT_DEFAULTS = FlightOptions()

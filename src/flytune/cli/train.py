@@ -1,5 +1,6 @@
 """`flytune train`."""
 
+import sys
 from typing import Annotated
 
 from cyclopts import Parameter
@@ -29,7 +30,9 @@ def train(
     tensorboard: Annotated[Flag, Parameter(help="write event files for TensorBoard as well")] = False,
 ) -> None:
     """Train a policy for a task, and print its run directory last."""
+    from flytune.control.policy import save_policy
     from flytune.evaluation.evaluate import evaluate, write_evaluation
+    from flytune.evaluation.response_map import response_map, with_maps
     from flytune.runs.directory import new_directory
     from flytune.task.task import load_task
     from flytune.training.loop import train
@@ -45,6 +48,12 @@ def train(
         run = train(
             wanted, trainer, seed=seed, out=out, resume=resume, tensorboard=tensorboard, on_progress=on_progress
         )
+    if wanted.dial:
+        print("measuring the response at each setting of the dial", file=sys.stderr)
+        policy = with_maps(run.policy, wanted)
+        save_policy(out / "policy.safetensors", policy)
+        for name in policy.dials:
+            print(response_map(policy, name).table(), end="\n\n")  # pyright: ignore[reportOptionalMemberAccess]
     evaluation = evaluate(run.policy, wanted, name=str(out))
     write_evaluation(out, evaluation.judgement)
     print(evaluation.judgement.line())

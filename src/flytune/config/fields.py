@@ -9,6 +9,8 @@ from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_typ
 import annotated_types
 from pydantic import AllowInfNan, Strict
 
+from flytune.config.formula import Formula
+
 Real = Annotated[float, Strict(), AllowInfNan(False)]
 Whole = Annotated[int, Strict()]
 Vector = tuple[Real, Real, Real]
@@ -39,7 +41,9 @@ def allowed(annotation: Any) -> str:
                 upper = alone = f"below {bound}"
             case annotated_types.Le(le=bound):
                 upper, alone = f"{bound}", f"{bound} or less"
-    other = {float: "a finite number", int: "", str: "text", bool: "true or false"}.get(base, str(base))
+    other = {float: "a finite number", int: "", str: "text", bool: "true or false", Formula: "a formula"}.get(
+        base, str(base)
+    )
     text = f"{lower} to {upper}" if lower and upper else alone or other
     return ", ".join(filter(None, ("a whole number" if base is int else "", text)))
 

@@ -15,7 +15,7 @@ def plain(node: Any) -> dict[str, Any]:
     return {
         field.name: _plain_value(value)
         for field, value in values
-        if value is not None and not (field.metadata.get("label") and value in ({}, ""))
+        if value is not None and not (_is_optional(field) and value in ({}, ""))
     }
 
 
@@ -36,6 +36,10 @@ def source_of(path: str, sources: Mapping[str, str]) -> str:
     while path and not sources.get(path):
         path = path.rpartition(".")[0]
     return sources.get(path, "")
+
+
+def _is_optional(field: dataclasses.Field[Any]) -> bool:
+    return field.default is not dataclasses.MISSING or field.default_factory is not dataclasses.MISSING
 
 
 def _plain_value(value: Any) -> Any:

@@ -1,5 +1,6 @@
 """Learned controllers: the network, the policy around it, and its file."""
 
+import dataclasses
 import itertools
 import json
 from collections.abc import Sequence
@@ -13,10 +14,13 @@ import safetensors
 import safetensors.numpy
 from jaxtyping import Array, Float
 
+from flytune.config import document
 from flytune.config.files import write_bytes
 from flytune.config.pytree import label, pytree, static
 from flytune.errors import BadInput
 from flytune.task import observation
+from flytune.task.dial import Dial, Input, Setting, checked_setting, number_of_inputs, told
+from flytune.task.observation import SIZE
 
 FORMAT = "flytune-policy-1"
 HEADER = "flytune"  # one entry: safetensors writes several in an order that changes from process to process
@@ -61,23 +65,66 @@ def make_network(key: jax.Array, sizes: Sequence[int], last_gain: float) -> Netw
 
 @pytree
 class Policy:
-    """A learned controller: the deterministic action of its actor, squashed into [-1, 1]."""
+    """A learned controller: the deterministic action of its actor, squashed into [-1, 1].
+
+    A policy with dials flies at its `setting`; `at` gives the same policy at another one.
+    """
 
     actor: Network
     input_scale: Float[Array, "17"]  # the observation times this is the input of the actor
     squash: Literal["clip", "tanh"] = static()  # PPO: the mean is clipped; analytic policy gradient: smooth
+    dials: dict[str, Dial] = dataclasses.field(default_factory=dict)  # empty for a policy with one response
+    inputs: dict[str, Input] = dataclasses.field(default_factory=dict)  # of the actor, behind the observation
+    setting: dict[str, Any] = dataclasses.field(default_factory=dict)  # dial -> its value
     about: dict[str, Any] = label(default_factory=dict)  # task, vehicle, trainer: in the header of the file
+    maps: dict[str, Any] = label(default_factory=dict)  # dial -> its measured response, see evaluation/response_map.py
 
-    def __call__(self, observation: Float[Array, "*batch 17"]) -> Float[Array, "*batch 4"]:
-        """The action in [-1, 1] for one observation or a batch of them."""
-        raw = self.actor(observation * self.input_scale)
+    def __call__(
+        self, observation: Float[Array, "*batch 17"], setting: Setting | None = None
+    ) -> Float[Array, "*batch 4"]:
+        """The action in [-1, 1] for one observation or a batch of them, at a setting; its own where None."""
+        scaled = observation * self.input_scale
+        if self.inputs:  # these are not scaled
+            further = told(self.inputs, observation, self.setting if setting is None else setting)[..., SIZE:]
+            scaled = jnp.concatenate([scaled, further], axis=-1)
+        raw = self.actor(scaled)
         return jnp.tanh(raw) if self.squash == "tanh" else jnp.clip(raw, -1.0, 1.0)
 
     def __repr__(self) -> str:
         sizes = "-".join(map(str, self.actor.sizes))
         known = {"task", "vehicle"} <= self.about.keys()
         made_for = f", {self.about['task']} on {self.about['vehicle']}" if known else ""
-        return f"Policy({sizes}, {self.squash}{made_for})"
+        dials = "".join(f", {name} {float(self.setting[name]):g}" for name in self.dials)
+        return f"Policy({sizes}, {self.squash}{made_for}{dials})"
+
+    def at(self, setting: Setting | None = None, /, **values: float) -> "Policy":
+        """The policy with its dials set; a dial that is not named keeps its value.
+
+        Raises:
+            BadInput: an unknown dial, or a value out of range.
+        """
+        wanted = {**self.setting, **(setting or {}), **values}
+        return dataclasses.replace(self, setting=checked_setting(self.dials, wanted))
+
+    def fixed(self) -> "Policy":
+        """The policy of the 17 observations alone that gives the same actions as this one at its setting.
+
+        At a fixed setting every further input is a constant, or a multiple of a part of the observation. So it becomes
+        a part of the first bias, or of the first weights.
+        """
+        first, *others = self.actor.weights
+        bias, *biases = self.actor.biases
+        weight, place = first[:SIZE], SIZE
+        for name in sorted(self.inputs):
+            each = self.inputs[name]
+            value, rows = each.value.value(self.setting), first[place : place + each.size]
+            place += each.size
+            if each.of:
+                weight = weight.at[each.rows()].add(value * rows / self.input_scale[each.rows(), None])
+            else:
+                bias = bias + value * rows[0]
+        actor = Network(weights=(weight, *others), biases=(bias, *biases))
+        return dataclasses.replace(self, actor=actor, dials={}, inputs={}, setting={}, maps={})
 
     def initial_memory(self) -> tuple[()]:
         """Nothing: the policy is a function of the observation alone."""
@@ -98,6 +145,11 @@ def save_policy(path: Path, policy: Policy) -> None:
     for part, layers in (("weight", policy.actor.weights), ("bias", policy.actor.biases)):
         tensors |= {f"actor.{index}.{part}": np.asarray(layer) for index, layer in enumerate(layers)}
     header = {"format": FORMAT, "squash": policy.squash, **CONVENTIONS, "about": policy.about}
+    if policy.dials:
+        for part in ("dials", "inputs"):
+            header[part] = {name: document.plain(each) for name, each in getattr(policy, part).items()}
+        header["setting"] = {name: float(value) for name, value in policy.setting.items()}
+        header["maps"] = policy.maps
     write_bytes(path, safetensors.numpy.save(tensors, metadata={HEADER: json.dumps(header, sort_keys=True)}))
 
 
@@ -124,7 +176,7 @@ def load_policy(path: Path) -> Policy:
     header = header if isinstance(header, dict) else {}
     if header.get("format") != FORMAT:
         raise BadInput(f"{path}: is not a flytune policy (format {header.get('format')!r}). Allowed: {FORMAT}.")
-    if not isinstance(header.get("about", {}), dict):
+    if not all(isinstance(header.get(part, {}), dict) for part in ("about", "maps")):
         raise BadInput(f"{path}: has a damaged header. Train it again.")
     if header.get("observation") != observation.LAYOUT:
         raise BadInput(
@@ -140,13 +192,14 @@ def _assemble(path: Path, header: dict[str, Any], tensors: dict[str, np.ndarray]
     if layers < 1 or set(tensors) != names or header.get("squash") not in ("clip", "tanh"):
         raise BadInput(f"{path}: is a damaged policy (tensors {sorted(tensors)}). Train it again.")
     weights, biases = ([tensors[f"actor.{i}.{part}"] for i in range(layers)] for part in ("weight", "bias"))
-    width = observation.SIZE
+    dials, inputs, setting = _dials(path, header)
+    width = SIZE + number_of_inputs(inputs)
     for index, (weight, bias) in enumerate(zip(weights, biases, strict=True)):
         wanted = (width, weight.shape[1]) if weight.ndim == 2 else "a matrix"
         if weight.shape != wanted or bias.shape != weight.shape[1:]:
             raise BadInput(f"{path}: layer {index} has shape {weight.shape}, allowed: {wanted}. Train it again.")
         width = weight.shape[1]
-    if width != 4 or tensors["input_scale"].shape != (observation.SIZE,):
+    if width != 4 or tensors["input_scale"].shape != (SIZE,):
         raise BadInput(f"{path}: maps {tensors['input_scale'].shape} to {width}, allowed: 17 to 4. Train it again.")
     for name, tensor in tensors.items():
         if not np.all(np.isfinite(tensor)):
@@ -155,5 +208,24 @@ def _assemble(path: Path, header: dict[str, Any], tensors: dict[str, np.ndarray]
         actor=Network(weights=tuple(map(jnp.asarray, weights)), biases=tuple(map(jnp.asarray, biases))),
         input_scale=jnp.asarray(tensors["input_scale"]),
         squash=header["squash"],
+        dials=dials,
+        inputs=inputs,
+        setting=setting,
         about=header.get("about", {}),
+        maps=header.get("maps", {}),
     )
+
+
+def _dials(path: Path, header: dict[str, Any]) -> tuple[dict[str, Dial], dict[str, Input], dict[str, float]]:
+    """The dials of a policy's header, its further inputs and its setting."""
+    dials = document.read(dict[str, Dial], header.get("dials", {}), f"{path}: dials")
+    inputs = document.read(dict[str, Input], header.get("inputs", {}), f"{path}: inputs")
+    given = header.get("setting", {})
+    setting = checked_setting(dials, given if isinstance(given, dict) else {}, f"{path}: setting")
+    for name, each in inputs.items():
+        try:
+            for values in ({dial: getattr(dials[dial], end) for dial in dials} for end in ("lowest", "highest")):
+                each.value.value(values)
+        except (ArithmeticError, ValueError) as error:
+            raise BadInput(f"{path}: input {name} is damaged ({error}). Train it again.") from None
+    return dials, inputs, setting

@@ -7,6 +7,7 @@ from typing import Any
 
 from flytune.config.files import make_folder, write_json
 from flytune.control.controller import Controller
+from flytune.control.schedule import Schedule
 from flytune.evaluation.flights import Flights
 from flytune.evaluation.fly import fly
 from flytune.evaluation.judge import Judgement, judge
@@ -33,7 +34,12 @@ class Evaluation:
 
 
 def evaluate(
-    controller: str | Controller, task: str | Path | Task | None = None, *, name: str = "", **settings: Any
+    controller: str | Controller,
+    task: str | Path | Task | None = None,
+    *,
+    name: str = "",
+    dial: Schedule | None = None,
+    **settings: Any,
 ) -> Evaluation:
     """The flights and the judgement of one controller over many trials.
 
@@ -43,13 +49,15 @@ def evaluate(
         task: the task to fly: a preset, a TOML file or a Task; where None, the one the controller was trained for, or
             the baseline for a controller that says none.
         name: the controller's name in tables; where empty, the one it was found by.
+        dial: of a policy with dials: dial -> its value, or pairs [[time in s, value], ...] by which it is turned in
+            flight; the policy's own setting where None.
         **settings: of `fly`: trials, seed, duration, initial_conditions, simulator, simulator_options.
 
     Raises:
         BadInput: the controller, the task or a setting cannot be used.
         Diverged: the controller returned an action that is not finite.
     """
-    found = _find(controller, task, name)
+    found = _find(controller, task, name, dial)
     flights = fly(found.controller, found.task, name=found.name, **settings)
     return Evaluation(
         name=found.name,
@@ -62,18 +70,26 @@ def evaluate(
 
 
 def evaluate_all(
-    controllers: Sequence[str | Controller], task: str | Path | Task | None = None, **settings: Any
+    controllers: Sequence[str | Controller],
+    task: str | Path | Task | None = None,
+    *,
+    dial: Schedule | None = None,
+    **settings: Any,
 ) -> list[Evaluation]:
     """The evaluations of several controllers, see `evaluate`; all of them are found before the first one flies."""
-    return [evaluate(found, **settings) for found in [_find(controller, task) for controller in controllers]]
+    found = [_find(controller, task, dial=dial) for controller in controllers]
+    return [evaluate(each, **settings) for each in found]
 
 
-def _find(controller: str | Controller, task: str | Path | Task | None, name: str = "") -> FoundController:
+def _find(
+    controller: str | Controller, task: str | Path | Task | None, name: str = "", dial: Schedule | None = None
+) -> FoundController:
     wanted = load_task(task) if isinstance(task, str | Path) else task
     found = find_controller(controller, wanted) if isinstance(controller, str) else controller
     if not isinstance(found, FoundController):
-        return FoundController(name=name, controller=found, task=wanted or load_task("baseline"))
-    return dataclasses.replace(found, name=name or found.name, task=wanted or found.task)
+        found = FoundController(name=name, controller=found, task=wanted or load_task("baseline"))
+    found = dataclasses.replace(found, name=name or found.name, task=wanted or found.task)
+    return found.with_dial(dial) if dial else found
 
 
 def write_evaluation(folder: Path, judgement: Judgement) -> None:

@@ -27,6 +27,8 @@ from flytune.task.task import Task
 
 ACTION = slice(SIZE - 4, SIZE)  # of an observation: the last action, which carries no noise
 InitialConditions = Literal["clear", "paper"]
+CHUNK = 100  # steps that are flown by one compiled program
+TRANSITION = 1.5  # s after a dial is turned, by when the bounds of the new setting hold (docs/dial.md)
 
 
 def fly(
@@ -64,6 +66,8 @@ def fly(
     """
     if isinstance(controller, FoundController):
         controller, name = controller.controller, name or controller.name
+    settings = settings_for(controller, task)
+    along, task = [(step, task.at(setting)) for step, setting in settings], task.at(settings[0][1])
     duration = task.duration if duration is None else duration
     if not 1 <= trials <= 100_000:
         raise BadInput(f"trials: {trials} is not allowed. Allowed: a whole number, 1 to 100000.")
@@ -92,16 +96,16 @@ def fly(
     finally:
         made.close()
     states, actions = np.asarray(record.states), np.asarray(record.actions)
-    along = VehicleStates.from_rows(np.ascontiguousarray(states.transpose(2, 0, 1)))
+    trajectories = VehicleStates.from_rows(np.ascontiguousarray(states.transpose(2, 0, 1)))
     return Flights(
         time=np.arange(steps + 1) * CONTROL_PERIOD,
-        **{field: getattr(along, field) for field in WIDTHS},
+        **{field: getattr(trajectories, field) for field in WIDTHS},
         action=np.ascontiguousarray(actions.transpose(2, 0, 1)),
         crashed=np.asarray(record.crashed),
-        margins={name: np.asarray(margin) for name, margin in _margins(task, states, actions).items()},
+        margins=_margins_along(along, states, actions),
         target_position=np.asarray(task.target.position),
         target_yaw=float(task.target.yaw),
-        speed_bound=task.speed_bound,
+        speed_bound=_largest([each.speed_bound for _, each in along]),
         name=name,
         task=task.name,
         vehicle=task.vehicle.name,
@@ -109,6 +113,38 @@ def fly(
         seed=seed,
         initial_conditions=initial_conditions,
     )
+
+
+def settings_for(controller: Any, task: Task) -> list[tuple[int, dict[str, float]]]:
+    """The settings of a task's dials in a flight, each with the control step from which it holds.
+
+    A dial that the controller has is set as in the controller; any other is at its default.
+    """
+    default = {name: float(dial.default) for name, dial in task.dial.items()}
+    settings = controller.settings() if hasattr(controller, "settings") else [(0, getattr(controller, "setting", {}))]
+    return [(step, {name: float(own.get(name, value)) for name, value in default.items()}) for step, own in settings]
+
+
+def _largest(bounds: list[float | None]) -> float | None:
+    """The largest of all speed bounds, None where one is None."""
+    return max((each for each in bounds if each is not None), default=None) if None not in bounds else None
+
+
+def _margins_along(tasks: list[tuple[int, Task]], states: np.ndarray, actions: np.ndarray) -> dict[str, np.ndarray]:
+    """The margins [N, T + 1] of flights in which the task changes at given steps, by the bounds that hold at each step.
+
+    After a change the vehicle has `TRANSITION` seconds, in which the wider of the bounds before and after it holds.
+    """
+    (_, first), *changes = tasks
+    found = {name: np.array(margin) for name, margin in _margins(first, states, actions).items()}
+    for step, task in changes:
+        after = {name: np.asarray(margin) for name, margin in _margins(task, states, actions).items()}
+        end = step + round(TRANSITION / CONTROL_PERIOD)
+        found = {name: margin.copy() for name, margin in found.items()}
+        for name, margin in found.items():
+            margin[:, step:end] = np.maximum(margin[:, step:end], after[name][:, step:end])
+            margin[:, end:] = after[name][:, end:]
+    return found
 
 
 def _check_controller(controller: Any) -> None:
@@ -222,30 +258,63 @@ def _started(task: Task, starts: jax.Array) -> Episode:
     return jax.vmap(one, in_axes=-1, out_axes=-1)(starts)
 
 
-@program(static=["physics", "steps"])
 def _rollout_on_device(
-    physics: Any, controller: Any, task: Task, starts: jax.Array, noise_keys: jax.Array, steps: int
-) -> tuple[Record, jax.Array, jax.Array]:
-    """The record, the actions as given [T, N, 4], and which of them are finite [T, N]."""
+    physics: Any, controller: Any, task: Task, starts: Any, noise_keys: Any, steps: int
+) -> tuple[Record, np.ndarray, np.ndarray]:
+    """The record, the actions as given [T, N, 4], and which of them are finite [T, N].
+
+    All parts of `CHUNK` steps share one compiled program, so that another duration compiles nothing.
+    """
+    episodes, memory = _start(controller, task, starts)
+    parts = []
+    for first in range(0, steps, CHUNK):
+        number = min(CHUNK, steps - first)
+        episodes, memory, *part = _steps_on_device(
+            physics, controller, task, episodes, memory, noise_keys, np.int32(first), number
+        )
+        parts.append([np.asarray(each) for each in part])
+    states, actions, given, finite = (np.concatenate(each) for each in zip(*parts, strict=True))
+    states = np.concatenate([np.asarray(starts)[None], states])
+    actions = np.concatenate([np.zeros_like(actions[:1]), actions])
+    return Record(states, actions, np.asarray(episodes.steps) < 0), given, finite
+
+
+@program()
+def _start(controller: Any, task: Task, starts: jax.Array) -> tuple[Episode, Any]:
+    """The episodes that begin in states [17, N], and the controller's memory for each."""
+    return _started(task, starts), _initial_memory(controller, starts.shape[-1])
+
+
+@program(static=["physics", "steps"])
+def _steps_on_device(
+    physics: Any,
+    controller: Any,
+    task: Task,
+    episodes: Episode,
+    memory: Any,
+    noise_keys: jax.Array,
+    first: Any,
+    steps: int,
+) -> tuple[Any, ...]:
+    """The episodes and the memory after some steps from step `first` on; and [steps, ...] states, actions, actions as
+    given, and which of them are finite.
+    """  # fmt: skip
 
     def decide(memory: Any, seen: jax.Array, drawn: Any, episodes: Episode) -> Any:
         memory, action, given, finite = _decide(controller, memory, seen)
         return memory, action, (given, finite)
 
-    (episodes, _), step = rollout(
+    (episodes, memory), step = rollout(
         task,
         decide,
-        (_started(task, starts), _initial_memory(controller, starts.shape[-1])),
-        jnp.arange(steps),
+        (episodes, memory),
+        first + jnp.arange(steps),
         ending=hold,
-        record=lambda after, moved, outcome: (state_numbers(after.state), after.last_action),
+        record=lambda task, after, moved, outcome: (state_numbers(after.state), after.last_action),
         draw=lambda index: Draw(noise=_noise(noise_keys, index)),
         physics=physics,
     )
-    states, actions = step.record
-    states = jnp.concatenate([starts[None], states])
-    actions = jnp.concatenate([jnp.zeros_like(actions[:1]), actions])
-    return Record(states, actions, episodes.steps < 0), *step.notes
+    return episodes, memory, *step.record, *step.notes
 
 
 @program()

@@ -8,9 +8,11 @@ from typing import Any
 
 import jax
 
+from flytune.config import document
 from flytune.control.classical import CLASSICAL, classical_controller
 from flytune.control.controller import Controller
-from flytune.control.policy import load_policy
+from flytune.control.policy import Policy, load_policy
+from flytune.control.schedule import Schedule, with_schedule
 from flytune.errors import BadInput
 from flytune.export.untrusted.onnx_controller import load_onnx
 from flytune.export.untrusted.sb3_model import load_sb3
@@ -40,6 +42,19 @@ class FoundController:
         """The memory and the action of the controller, see `Controller`."""
         return self.controller.act(memory, observation)
 
+    def with_dial(self, schedule: Schedule, name: str = "") -> "FoundController":
+        """The controller with its dials set or scheduled, see `with_schedule`.
+
+        Raises:
+            BadInput: the controller has no dial, an unknown dial, or a value out of range.
+        """
+        if not isinstance(self.controller, Policy) or not self.controller.dials:
+            raise BadInput(
+                f"{self.name}: has no dial. Allowed: a policy with dials, for instance dial@speed=0.5; "
+                "`flytune train dial` trains one."
+            )
+        return dataclasses.replace(self, controller=with_schedule(self.controller, schedule), name=name or self.name)
+
     def __repr__(self) -> str:
         return f"FoundController({self.name}, {self.controller!r}, for {self.task.name})"
 
@@ -56,13 +71,18 @@ def find_controller(name: str, task: str | Task | None = None) -> FoundControlle
     """The controller that a run directory, a policy file or the name of a classical controller stands for.
 
     A policy file is one of flytune, ONNX or a Stable-Baselines3 model `model.zip`; classical controllers are `pid`,
-    `geometric` and `lqr` (gains tuned by search; `pid@textbook` for those of the books). `task` is the task to fly, a
-    preset, a TOML file or a task; where None, that of the controller's training, or the baseline.
+    `geometric` and `lqr` (gains tuned by search; `pid@textbook` for those of the books). A policy with dials may be
+    followed by a setting, as in `dial@speed=0.5`. `task` is the task to fly, a preset, a TOML file or a task; where
+    None, that of the controller's training, or the baseline.
 
     Raises:
         BadInput: no controller has this name, or it cannot be used.
     """
     wanted = load_task(task) if isinstance(task, str) else task
+    base, at, setting = name.rpartition("@")
+    if at and "=" in setting and not os.path.exists(name):
+        found = find_controller(base, wanted)
+        return found.with_dial(dict(map(document.parse_assignment, setting.split(","))), name)
     path = Path(name)
     if os.path.isdir(name):  # unlike Path.is_dir, also where the name is too long to be one
         return _from_run(name, path, wanted)
@@ -70,7 +90,7 @@ def find_controller(name: str, task: str | Task | None = None) -> FoundControlle
         return _from_file(name, path, wanted)
     kind, at, gains = name.partition("@")
     if kind in CLASSICAL:
-        wanted = wanted or load_task("baseline")
+        wanted = (wanted or load_task("baseline")).at()  # it has no dial: those of the task are at their defaults
         controller = classical_controller(kind, wanted, gains if at else "tuned")
         about = {"controller": kind, "gains": gains or "tuned"}
         return FoundController(name=name, controller=controller, task=wanted, about=about)

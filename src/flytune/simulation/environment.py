@@ -74,6 +74,11 @@ def observe(task: Task, episode: Episode, normal: Float[Array, "13"]) -> Float[A
     return observation.observe(task.target, task.noise, episode.state, episode.last_action, normal)
 
 
+def see(family: TaskFamily, episode: Episode, normal: Float[Array, "13"]) -> Float[Array, "_"]:
+    """What a controller is given of an episode: the noisy observation, and the further inputs of the family."""
+    return family.see(observe(family.member(episode.numbers), episode, normal), episode.numbers)
+
+
 def step(
     task: Task, episode: Episode, action: Float[Array, "4"], physics: Physics = dynamics.step
 ) -> tuple[Episode, Outcome]:

@@ -23,7 +23,7 @@ from flytune.physics import dynamics
 from flytune.simulation import environment
 from flytune.simulation.environment import Episode, Physics
 from flytune.task.observation import draw_noise
-from flytune.task.task import TaskFamily
+from flytune.task.task import Task, TaskFamily
 
 Memory = Any  # a controller's pytree, the batch along the first axis
 
@@ -42,7 +42,7 @@ class Step(NamedTuple):
     """The results of a rollout at every step, [T, ...]."""
 
     notes: Any  # what `decide` gave beside the action
-    following: Any  # [T, N, 17] the observation after the step, where `Draw.next_noise` asks for it
+    following: Any  # [T, N, ...] the observation after the step, where `Draw.next_noise` asks for it
     record: Any  # what `record` kept
 
 
@@ -63,12 +63,12 @@ def split_keys(key: Array, steps: int, number: int) -> Array:
 
 def rollout(
     family: TaskFamily,
-    decide: Callable[[Memory, Float[Array, "N 17"], Any, Episode], tuple[Memory, Float[Array, "N 4"], Any]],
+    decide: Callable[[Memory, Float[Array, "N _"], Any, Episode], tuple[Memory, Float[Array, "N 4"], Any]],
     start: tuple[Episode, Memory],
     inputs: Any,
     *,
     ending: Callable[..., Any] = environment.restart,
-    record: Callable[[Episode, Episode, environment.Outcome], Any],
+    record: Callable[[Task, Episode, Episode, environment.Outcome], Any],
     draw: Callable[[Any], Draw] = lambda given: given,
     fresh_memory: Memory = None,
     slack: Any = None,
@@ -80,12 +80,12 @@ def rollout(
 
     Args:
         family: the task, or the family whose numbers each episode carries.
-        decide: (memory, observation [N, 17], Draw.controller, episodes) -> (memory, action [N, 4], notes). With an
-            `Actor` all steps are one kernel where `inputs` are the keys of all steps.
+        decide: (memory, observation [N, 17 and further inputs], Draw.controller, episodes) -> (memory, action [N, 4],
+            notes). With an `Actor` all steps are one kernel where `inputs` are the keys of all steps.
         start: N episodes and the controller's memory.
         inputs: scanned over time [T, ...]; each slice goes to `draw`.
         ending: what follows a step, `environment.restart` or `environment.hold`.
-        record: (episode after, episode the step led to, outcome) -> what is kept; applied to one episode.
+        record: (task, episode after, episode the step led to, outcome) -> what is kept; applied to one episode.
         draw: a slice of `inputs` -> the random numbers of a step.
         fresh_memory: the memory of new episodes, batched like the memory; None keeps the memory through an ending.
         slack: share of a bound by which a margin may be overdrawn before the episode ends; None for none.
@@ -95,9 +95,9 @@ def rollout(
     episodes, memory = start
     restore = ravel_pytree(jax.tree.map(lambda leaf: leaf[..., 0], episodes))[1]
 
-    def look(family: TaskFamily, numbers: Float[Array, "K"], noise: Any) -> Float[Array, "17"]:
+    def look(family: TaskFamily, numbers: Float[Array, "K"], noise: Any) -> Float[Array, "_"]:
         episode = restore(numbers)
-        return environment.observe(family.member(episode.numbers), episode, _normal(noise))
+        return environment.see(family, episode, _normal(noise))
 
     def move(family: TaskFamily, numbers: Float[Array, "K"], action: Float[Array, "4"], key: Any, noise: Any) -> Any:
         episode = restore(numbers)
@@ -106,8 +106,8 @@ def rollout(
         if slack is not None:
             outcome = environment.with_slack(task, moved, outcome, slack)
         after, over = ending(family, episode, moved, outcome, key)
-        following = None if noise is None else environment.observe(task, moved, _normal(noise))
-        return ravel_pytree(after)[0], over, following, record(after, moved, outcome)
+        following = None if noise is None else environment.see(family, moved, _normal(noise))
+        return ravel_pytree(after)[0], over, following, record(task, after, moved, outcome)
 
     def move_packed(*given: Any) -> Any:
         numbers, over, following, kept = move(*given)

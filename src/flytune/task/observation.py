@@ -17,7 +17,8 @@ from flytune.physics.dynamics import State
 from flytune.task.situation import Target, attitude_error, position_error
 
 SIZE = 17
-BLOCKS = (3, 4, 3, 3, 4)  # position error, attitude error, velocity, body rate, last action
+BLOCK_NAMES = ("position_error", "attitude_error", "velocity", "body_rate", "last_action")
+BLOCKS = (3, 4, 3, 3, 4)  # numbers in each
 NOISY = 13  # the first 13 carry noise; the last action does not
 LAYOUT = (
     "position_error (3) [m], attitude_error (4) [x y z w], velocity (3) [m/s, inertial], "

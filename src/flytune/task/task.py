@@ -1,5 +1,7 @@
 """A task: target, initial states, noise, reward, terminations, vehicle and training settings, in one file."""
 
+import dataclasses
+import itertools
 import os
 import re
 from importlib import resources
@@ -7,15 +9,19 @@ from pathlib import Path
 from typing import Annotated, Any, Protocol, runtime_checkable
 
 import jax
+import jax.numpy as jnp
 from annotated_types import Ge, Gt, Le, Unit
+from jaxtyping import Array, Float
 
 from flytune.config import document, nested
 from flytune.config.document import Real, Whole
+from flytune.config.formula import FUNCTIONS, Formula
 from flytune.config.pytree import label, pytree
 from flytune.errors import BadInput
 from flytune.physics.vehicle import Vehicle, vehicle_table
+from flytune.task.dial import Dial, Input, Setting, checked_setting, number_of_inputs, told, with_field
 from flytune.task.initial_state import InitialState
-from flytune.task.observation import ObservationNoise
+from flytune.task.observation import SIZE, ObservationNoise
 from flytune.task.reward import RewardTerm
 from flytune.task.situation import Target
 from flytune.task.termination import Termination
@@ -50,6 +56,9 @@ class Task:
     reward: dict[str, RewardTerm]
     termination: dict[str, Termination]
     vehicle: Vehicle
+    dial: dict[str, Dial] = dataclasses.field(default_factory=dict)  # numbers that may be set at any time
+    follow: dict[str, Formula] = dataclasses.field(default_factory=dict)  # field path -> formula of the dials
+    input: dict[str, Input] = dataclasses.field(default_factory=dict)  # what the controller is told of the dials
     ppo: PpoSettings = label(default_factory=PpoSettings)
     apg: ApgSettings = label(default_factory=ApgSettings)
     sources: dict[str, str] = label(default_factory=dict)
@@ -71,13 +80,49 @@ class Task:
         """The tightest bound on speed in m/s, or None where there is none."""
         return self.limit("speed")
 
-    def draw(self, key: jax.Array) -> tuple[tuple[()], jax.Array]:
-        """No numbers, and the key itself: a task is a family of one, see `TaskFamily`."""
-        return (), key
+    @property
+    def inputs(self) -> int:
+        """How many numbers a controller of this task is given: 17, and those of its dials."""
+        return SIZE + number_of_inputs(self.input)
 
-    def member(self, numbers: tuple[()]) -> "Task":
-        """The task itself."""
-        return self
+    def draw(self, key: jax.Array) -> tuple[Any, jax.Array]:
+        """The settings of the dials of one episode; without a dial nothing, and the key itself. See `TaskFamily`."""
+        if not self.dial:
+            return (), key
+        key, *keys = jax.random.split(key, 1 + len(self.dial))
+        return {name: self.dial[name].draw(each) for name, each in zip(sorted(self.dial), keys, strict=True)}, key
+
+    def turn(self, numbers: Any, key: jax.Array) -> Any:
+        """The settings of one episode before the next update: each dial is turned with its probability `turned`."""
+        for index, name in enumerate(sorted(self.dial)):
+            chance_key, value_key = jax.random.split(jax.random.fold_in(key, index))
+            dial = self.dial[name]
+            turned = jax.random.uniform(chance_key, ()) < dial.turned
+            numbers = {**numbers, name: jnp.where(turned, dial.draw(value_key), numbers[name])}
+        return numbers
+
+    def member(self, numbers: Any) -> "Task":
+        """The task at a setting of its dials, which all fields in `follow` follow; without a dial the task itself."""
+        if not self.dial:
+            return self
+        fixed = dataclasses.replace(self, dial={}, follow={}, input={})
+        numbers = jax.lax.stop_gradient(numbers)
+        for path, formula in self.follow.items():
+            fixed = with_field(fixed, tuple(path.split(".")), formula.value(numbers))
+        return fixed
+
+    def see(self, observation: Float[Array, "*batch 17"], numbers: Any) -> Float[Array, "*batch _"]:
+        """What a controller is given of an observation at a setting: the observation and the inputs of the dials."""
+        return told(self.input, observation, numbers)
+
+    def at(self, setting: Setting | None = None) -> "Task":
+        """The fixed task at a setting of the dials, a dial that is not named at its default.
+
+        Raises:
+            BadInput: an unknown dial, a value out of range, or a field that would have a value that is not allowed.
+        """
+        values = checked_setting(self.dial, setting or {})
+        return _at(self, values) if self.dial else self
 
     def problem(self) -> str | None:
         """What makes the numbers impossible together, or None."""
@@ -85,7 +130,7 @@ class Task:
             return "reward: no term. Allowed: one or more tables [reward.NAME]."
         if not re.fullmatch(r"[\w .+-]{1,100}", self.name):
             return f"name: {self.name[:100]!r} cannot name a run. Allowed: up to 100 letters, digits and . _ + - signs."
-        return None
+        return _problem_of_dials(self)
 
 
 @runtime_checkable
@@ -101,6 +146,10 @@ class TaskFamily(Protocol):
 
     def member(self, numbers: Any) -> Task:
         """The task with these numbers; inside compiled code they are tracers."""
+        ...
+
+    def see(self, observation: Float[Array, "*batch 17"], numbers: Any) -> Float[Array, "*batch _"]:
+        """What a controller is given of an observation in an episode with these numbers."""
         ...
 
 
@@ -195,11 +244,19 @@ def _read(data: dict[str, Any], where: str = "") -> Task:
         if nested.look_up(data, old) is not None:
             raise BadInput(f"{f'{where}: ' if where else ''}{old}: is called {new} now. Write {new} instead.")
     vehicle = data.get("vehicle")
-    return document.read(Task, {**data, "vehicle": vehicle_table(vehicle)} if isinstance(vehicle, str) else data, where)
+    complete = {**data, "vehicle": vehicle_table(vehicle)} if isinstance(vehicle, str) else data
+    return _at_default(document.read(Task, complete, where), where)
 
 
 def _edited(data: dict[str, Any], path: str, value: Any) -> dict[str, Any]:
     """The task's tables after one edit, the source of what was edited now the user."""
+    if path in data.get("follow", {}):
+        formula = data["follow"][path]
+        raise BadInput(
+            f"{path}: follows the dials of this task, as {formula}. Change the formula instead: "
+            f"follow.'{path}' in a task file that says based_on; or set a dial, for instance "
+            f"{' '.join(f'dial.{name}.default=...' for name in data['dial'])}."
+        )
     if path == "vehicle" and isinstance(value, str):
         return {**data, "vehicle": vehicle_table(value)}
     data = nested.edit(data, path, value)
@@ -209,3 +266,73 @@ def _edited(data: dict[str, Any], path: str, value: Any) -> dict[str, Any]:
         if isinstance(sources, dict):  # else it is refused, with its name, when the task is read
             owner["sources"] = {**sources, field: "set by the user"}
     return data
+
+
+FOLLOWING = ("target", "noise", "reward", "termination", "vehicle", "duration")  # parts whose fields may follow a dial
+CHECKED = 5  # settings of each dial at which a task is checked
+
+
+def _problem_of_dials(task: Task) -> str | None:
+    """What makes the dials of a task and what follows them impossible, or None."""
+    if not task.dial and (task.follow or task.input):
+        return "dial: no dial, though `follow` or `input` needs one. Allowed: one or more tables [dial.NAME]."
+    for name in task.dial:
+        if not name.isidentifier() or name in FUNCTIONS:
+            return f"dial.{name}: cannot be used in a formula. Allowed: letters, digits and _, no name of a function."
+    formulas = {f"follow.{path}": formula for path, formula in task.follow.items()}
+    formulas |= {f"input.{name}.value": each.value for name, each in task.input.items()}
+    for where, formula in formulas.items():
+        try:
+            unknown = formula.names() - set(task.dial)
+        except ValueError as error:
+            return f"{where}: {str(formula)[:60]!r}: {error}."
+        if unknown:
+            return f"{where}: {min(unknown)} is no dial. Allowed: {', '.join(task.dial)}."
+    for path in task.follow:
+        if path.split(".")[0] not in FOLLOWING:
+            return f"follow.{path}: cannot follow a dial. Allowed: a field of {', '.join(FOLLOWING)}."
+    return None
+
+
+def _at_default(task: Task, where: str) -> Task:
+    """The task, where the fields that follow dials have their values at the default setting; all settings checked.
+
+    Raises:
+        BadInput: a field in `follow` does not exist, or has a value that is not allowed at some setting.
+    """
+    if not task.dial:
+        return task
+    prefix = f"{where}: " if where else ""
+    settings = itertools.product(*(dial.grid(CHECKED) for dial in task.dial.values()))
+    default = {name: dial.default for name, dial in task.dial.items()}
+    for values in settings:
+        _at(task, dict(zip(task.dial, values, strict=True)), prefix)
+    at_default = _at(task, default, prefix)
+    return dataclasses.replace(at_default, dial=task.dial, follow=task.follow, input=task.input)
+
+
+def _at(task: Task, setting: Setting, prefix: str = "") -> Task:
+    """The fixed task at a setting of all dials, every value checked."""
+    plain = document.plain(task)
+    for path, formula in task.follow.items():
+        if nested.look_up(plain, path) is None or isinstance(nested.look_up(plain, path), dict):
+            raise BadInput(f"{prefix}follow.{path}: the task has no such number. Allowed: the path of a field.")
+        plain = nested.edit(plain, path, _value(formula, setting, f"{prefix}follow.{path}"))
+    for name, each in task.input.items():
+        _value(each.value, setting, f"{prefix}input.{name}.value")
+    rest = {key: value for key, value in plain.items() if key not in ("dial", "follow", "input")}
+    try:
+        return document.read(Task, rest)
+    except BadInput as error:
+        raise BadInput(f"{prefix}at {_words(setting)}: {error}") from None
+
+
+def _value(formula: Formula, setting: Setting, where: str) -> float:
+    try:
+        return formula.value(setting)
+    except (ArithmeticError, ValueError) as error:
+        raise BadInput(f"{where}: {formula} has no value at {_words(setting)} ({error}).") from None
+
+
+def _words(setting: Setting) -> str:
+    return ", ".join(f"{name} {value:g}" for name, value in setting.items())

@@ -11,7 +11,7 @@ import math
 from typing import Annotated, Any, ClassVar, Literal
 
 import jax.numpy as jnp
-from annotated_types import Gt, Le, Unit
+from annotated_types import Ge, Gt, Le, Unit
 from jaxtyping import Array, Float, Int
 from pydantic import Field
 
@@ -23,6 +23,7 @@ from flytune.task.situation import Situation
 SAFE = -1  # cause of an episode that goes on
 
 
+@pytree
 class Bounded:
     """What every condition has beside its margin.
 
@@ -32,6 +33,7 @@ class Bounded:
 
     quantity: ClassVar[str]
     key: ClassVar[str] = "bound"
+    barrier: Annotated[Real, Ge(0), Unit("times apg.barrier_weight")] = 1.0  # of the analytic policy gradient
 
     @property
     def limit(self) -> Any:

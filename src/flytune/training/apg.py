@@ -28,7 +28,7 @@ from flytune.simulation.rollout import Draw, reset_all, rollout, split_keys
 from flytune.task.observation import SIZE, input_scale
 from flytune.task.task import Task
 from flytune.task.training_settings import ApgSettings
-from flytune.training.update import averaged, cores, descend, metrics_of, rollout_sums
+from flytune.training.update import averaged, cores, descend, metrics_of, network_scale, rollout_sums, turned
 
 PARTS = 2  # of a batch, which two cores can compute at the same time
 
@@ -78,7 +78,7 @@ def start(task: Task, settings: ApgSettings, key: Array) -> TrainState:
     """The training state before the first update."""
     task = dataclasses.replace(task, initial_state=settings.initial_state)
     actor_key, episode_key, key = jax.random.split(key, 3)
-    actor = make_network(actor_key, (SIZE, *settings.hidden, 4), last_gain=0.01)
+    actor = make_network(actor_key, (task.inputs, *settings.hidden, 4), last_gain=0.01)
     keys = jax.random.split(episode_key, settings.environments)
     episodes = reset_all(task, keys)
     return TrainState(
@@ -102,7 +102,7 @@ def warm_start(settings: ApgSettings, train_state: TrainState, policy: Policy) -
     The policy may have been trained on other multiples of the observation; the first layer makes up for that.
     """
     first, *others = policy.actor.weights
-    ratio = policy.input_scale / input_scale(settings.input_scale)
+    ratio = jnp.ones(len(first)).at[:SIZE].set(policy.input_scale / input_scale(settings.input_scale))
     actor = dataclasses.replace(policy.actor, weights=(first * ratio[:, None], *others))
     actor = jax.tree.map(jnp.array, actor)  # copies, because an update donates the memory of its state
     return dataclasses.replace(train_state, actor=actor, ema=jax.tree.map(jnp.array, actor))
@@ -138,6 +138,7 @@ def _part(
     """The gradient of a part of the batch, its episodes after the window, and its sums for the metrics."""
     width = settings.environments // number
     mine = jax.tree.map(lambda leaf: jax.lax.dynamic_slice_in_dim(leaf, index * width, width, axis=-1), episodes)
+    mine = turned(task, mine, jax.random.fold_in(jax.random.fold_in(key, index), 2))
     noise, keys = (
         split_keys(each, settings.window, width) for each in jax.random.split(jax.random.fold_in(key, index))
     )
@@ -170,13 +171,15 @@ def _loss(task: Task, settings: ApgSettings, actor: Network, episodes: Episode, 
     """Mean cost per step of a batch, the episodes it ends with, and the sums for its metrics."""
     task = dataclasses.replace(task, initial_state=settings.initial_state)
     first, *others = actor.weights
-    scaled = dataclasses.replace(actor, weights=(first * input_scale(settings.input_scale)[:, None], *others))
+    factor = network_scale(task, settings.input_scale)
+    scaled = dataclasses.replace(actor, weights=(first * factor[:, None], *others))
     parameters, sizes = ravel_pytree(scaled)[0], actor.sizes
 
     decide = Actor(parameters=parameters, sizes=sizes, squash=True)
 
-    def record(after: Episode, moved: Episode, outcome: Outcome) -> Any:
-        cost = sum((barrier(margin, settings) for margin in outcome.margins.values()), start=jnp.zeros(()))
+    def record(task: Task, after: Episode, moved: Episode, outcome: Outcome) -> Any:
+        costs = (task.termination[name].barrier * barrier(each, settings) for name, each in outcome.margins.items())
+        cost = sum(costs, start=jnp.zeros(()))
         return outcome.reward - cost, *jax.lax.stop_gradient((outcome, moved))
 
     (episodes, _), step = rollout(task, decide, (episodes, ()), draws, record=record, slack=settings.termination_slack)

@@ -133,7 +133,7 @@ def rollout(
         return memory, action, (seen, mean, action)
 
     (episodes, _), step = simulate(
-        task, decide, (episodes, ()), draws, record=lambda after, moved, outcome: (outcome, moved)
+        task, decide, (episodes, ()), draws, record=lambda task, after, moved, outcome: (outcome, moved)
     )
     (seen, mean, action), following, (outcome, moved) = step.notes, step.following * factor, step.record
     value, next_value = (

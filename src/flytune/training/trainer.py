@@ -38,6 +38,7 @@ class Trainer:
     extra: str = ""  # the extra of flytune that brings `packages`
     packages: tuple[str, ...] = ()  # optional packages that the trainer needs; run.json records their versions
     missing_settings: tuple[str, ...] = ()  # that the trainer lacks, which must therefore have their default values
+    supports_dials: bool = False  # whether it can train a task with dials
     supports_warm_start: bool = False  # whether a training can start from the weights of a policy
 
     def settings(self, task: Task) -> TrainerSettings:
@@ -65,6 +66,12 @@ class Trainer:
 
         for package in self.packages:
             require(package, self.extra)
+        if task.dial and not self.supports_dials:
+            able = ", ".join(each.name for each in TRAINERS.values() if each.supports_dials)
+            raise BadInput(
+                f"dial: a task with dials is not allowed with trainer {self.name}. Allowed: trainer {able}; or the "
+                "task at one setting, for instance from Python: task.at({...})."
+            )
         settings = self.settings(task)
         for name in self.missing_settings:
             value, default = (np.asarray(getattr(each, name)).tolist() for each in (settings, type(settings)()))
@@ -90,11 +97,11 @@ class Trainer:
 
     def policy(self, task: Task, train_state: Any) -> Policy:
         """The policy of the training: for PPO, of the moving average of the weights."""
-        return self._algorithm().policy(self.settings(task), train_state)
+        return _with_dials(self._algorithm().policy(self.settings(task), train_state), task)
 
     def last_policy(self, task: Task, train_state: Any) -> Policy:
         """The policy of the last update."""
-        return self._algorithm().last_policy(self.settings(task), train_state)
+        return _with_dials(self._algorithm().last_policy(self.settings(task), train_state), task)
 
     def warm_start(self, task: Task, train_state: Any, policy: Policy) -> Any:
         """The training state before the first update, with an actor that gives the actions of `policy`.
@@ -128,6 +135,12 @@ class Trainer:
         return import_module(self.module)
 
 
+def _with_dials(policy: Policy, task: Task) -> Policy:
+    """The policy with the dials of its task, at their defaults."""
+    setting = {name: float(dial.default) for name, dial in task.dial.items()}
+    return dataclasses.replace(policy, dials=task.dial, inputs=task.input, setting=setting)
+
+
 TRAINERS = {
     trainer.name: trainer
     for trainer in (
@@ -136,6 +149,7 @@ TRAINERS = {
             summary="analytic policy gradient, through the differentiable simulator",
             module="flytune.training.apg",
             settings_field="apg",
+            supports_dials=True,
             supports_warm_start=True,
         ),
         Trainer(

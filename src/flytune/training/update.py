@@ -1,20 +1,23 @@
 """The parts of an update that trainers share: the optimiser step, the average of the weights, and the metrics."""
 
 import ctypes
+import dataclasses
 import math
 import os
 import sys
+from collections.abc import Sequence
 from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
-from jaxtyping import Array
+from jaxtyping import Array, Float
 
 from flytune.errors import Diverged
-from flytune.simulation.environment import Outcome
+from flytune.simulation.environment import Episode, Outcome
 from flytune.simulation.host import Transition
+from flytune.task.observation import SIZE, input_scale
 from flytune.task.task import Task
 from flytune.task.termination import causes
 
@@ -41,6 +44,20 @@ def keep_freed_memory() -> None:
 def cores() -> int:
     """The number of processor cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def network_scale(task: Task, factors: Sequence[float]) -> Float[Array, "inputs"]:
+    """What each input of a network is multiplied with: one factor per block of the observation, 1 for all others."""
+    return jnp.concatenate([input_scale(factors), jnp.ones(task.inputs - SIZE)])
+
+
+def turned(task: Task, episodes: Episode, key: Array) -> Episode:
+    """The episodes [..., N] before an update, in some of which the dials of the task are turned."""
+    if not task.dial:
+        return episodes
+    keys = jax.random.split(key, episodes.steps.shape[-1])
+    numbers = jax.vmap(task.turn, in_axes=(-1, 0), out_axes=-1)(episodes.numbers, keys)
+    return dataclasses.replace(episodes, numbers=numbers)
 
 
 def descend(optimiser: optax.GradientTransformation, gradient: T, memory: Any, parameters: T) -> tuple[T, Any]:

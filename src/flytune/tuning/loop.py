@@ -9,7 +9,7 @@ from typing import Any
 from flytune.config import document
 from flytune.config.files import write_json, write_text
 from flytune.config.nested import first_difference
-from flytune.control.policy import Policy, load_policy
+from flytune.control.policy import Policy, load_policy, save_policy
 from flytune.errors import Diverged
 from flytune.evaluation.judge import Judgement
 from flytune.runs.directory import has_checkpoint
@@ -18,6 +18,7 @@ from flytune.training.loop import Progress, train
 from flytune.training.trainer import find_trainer
 from flytune.tuning import messages
 from flytune.tuning.choose import choose
+from flytune.tuning.flying import fly_for
 from flytune.tuning.history import VALIDATION_SEED, VALIDATION_TRIALS, History
 from flytune.tuning.iteration import Edit, Iteration, Validation
 from flytune.tuning.requirement import Requirement, ResponseSummary
@@ -25,7 +26,7 @@ from flytune.tuning.result import Tuning
 from flytune.tuning.rules import Rule, edited, to_dicts
 from flytune.tuning.sensitivity import load_sensitivities
 from flytune.tuning.slopes import Context
-from flytune.tuning.start import find_start, fly_for
+from flytune.tuning.start import find_start
 
 
 @dataclasses.dataclass(kw_only=True)
@@ -103,15 +104,15 @@ class Tuner:
     def begin(self) -> None:
         """Add the first iteration: the policy of the nearest known task, or a training where none is known."""
         start, first = self.start, Iteration(number=0)
-        if start.files is None or start.judgement is None:
+        if start.policy is None or start.record is None or start.judgement is None:
             self._say("start", f"{start.name}: no policy for this task is known; it is trained from new weights")
             self.train(first)
             return
-        self._say("start", messages.describe_start(start.name, start.times, self.duration))
+        self._say("start", messages.describe_start(start.name, start.times, start.setting, self.duration))
         folder = self.history.folder(0)
         folder.mkdir(parents=True, exist_ok=True)
-        shutil.copyfile(start.files[0], folder / "policy.safetensors")
-        shutil.copyfile(start.files[1], folder / "run.json")
+        save_policy(folder / "policy.safetensors", start.policy)
+        shutil.copyfile(start.record, folder / "run.json")
         write_text(folder / "task.toml", write_task(start.task))
         self._keep(dataclasses.replace(first, response=self._response(start.judgement)))
 
@@ -150,7 +151,7 @@ class Tuner:
 
     def task_of(self, iteration: Iteration) -> Task:
         """The task of an iteration: that of the start with the values of the iteration."""
-        if iteration.number == 0 and self.start.files is None:
+        if iteration.number == 0 and self.start.policy is None:
             return self.start.first
         return edited(self.tables, iteration.values, iteration.reasons)
 

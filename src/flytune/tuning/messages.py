@@ -58,8 +58,11 @@ def describe_fixed(edits: Mapping[str, Any], requirement: Requirement, constrain
     return f"by you: {fields}" + (f"; required in {share}: {', '.join(constraints)}" if constraints else "")
 
 
-def describe_start(name: str, times: Mapping[str, float], duration: float) -> str:
-    """The settling times of the known policies, and the one that the tuning starts with."""
+def describe_start(name: str, times: Mapping[str, float], setting: Mapping[str, float], duration: float) -> str:
+    """The settling times of the known policies, and the one that the tuning starts with, with its dial's setting."""
+    if setting:
+        words = ", ".join(f"{dial} at {value:g}" for dial, value in setting.items())
+        return f"the policy with a dial, {words}, settles in {times[name]:.2f} s; no training was needed for it"
     never = f"does not settle within {duration:g} s"
     known = ", ".join(f"{task} {f'{time:.2f} s' if math.isfinite(time) else never}" for task, time in times.items())
     nearest = f"; the tuning starts with {name}, which is nearest as a ratio" if len(times) > 1 else ""

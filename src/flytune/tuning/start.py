@@ -11,13 +11,15 @@ from flytune.control.classical import classical_controller
 from flytune.control.policy import Policy, load_policy
 from flytune.errors import BadInput
 from flytune.evaluation.fly import fly
-from flytune.evaluation.judge import Judgement, judge
+from flytune.evaluation.judge import Judgement
 from flytune.runs.shipped import shipped_files, shipped_name, shipped_names
 from flytune.task.task import Task, load_task
 from flytune.training.trainer import find_trainer
+from flytune.tuning.dial_start import DIAL, find_setting
 from flytune.tuning.feasibility import check_feasible
+from flytune.tuning.flying import fly_for
 from flytune.tuning.history import TRAINING_SEED, TRAINING_TRIALS
-from flytune.tuning.requirement import Requirement
+from flytune.tuning.requirement import Requirement, ResponseSummary
 from flytune.tuning.rules import edited, is_fixed
 
 KNOWN = ("acrobatic-refined", "baseline-refined", "inspection-refined")  # fastest first
@@ -32,7 +34,9 @@ class Start:
     name: str
     task: Task  # with the user's fields and the settings for a warm start
     first: Task  # the same, with the settings for a training from new weights
-    files: tuple[Path, Path] | None  # the policy, and run.json of its training; None where none is known
+    policy: Policy | None  # None where none is known
+    record: Path | None  # run.json of its training
+    setting: Mapping[str, float]  # of the dial that the policy was made from; empty without one
     judgement: Judgement | None  # of the policy on the training set
     times: Mapping[str, float]  # known task -> settling time in s of its policy, with the user's fields
 
@@ -55,32 +59,43 @@ def find_start(requirement: Requirement, wanted: str | None, edits: Mapping[str,
     flights = fly(anyone, first, trials=TRAINING_TRIALS, seed=TRAINING_SEED, duration=0.6)
     check_feasible(first, requirement, flights, tuple(edits))
     name = WITHOUT_POLICY if WITHOUT_POLICY in tasks else next(iter(tasks))
-    files = judgement = None
+    policy = record = judgement = None
     times: dict[str, float] = {}
     smallest = math.inf
+    dialled = find_setting(requirement, edits, trainer) if not wanted else None
+    if dialled is not None:
+        tasks[DIAL] = dialled.task
+        times[DIAL] = _time(dialled.response)
+        if not requirement.tightened().misses(dialled.response):
+            tasks = {DIAL: dialled.task}  # no other policy has to be flown
     for known, task in tasks.items():
-        if (found := _shipped(known, task, trainer)) is None:
+        if known == DIAL and dialled is not None:
+            found, judged = (dialled.policy, dialled.record), dialled.judgement
+        elif (files := _shipped(known, task, trainer)) is not None:
+            found = load_policy(files[0]), files[1]
+            judged = fly_for(requirement, found[0], task, TRAINING_SEED, TRAINING_TRIALS)
+            times[known] = _time(requirement.measure(judged))
+        else:
             continue
-        judged = fly_for(requirement, load_policy(found[0]), task, TRAINING_SEED, TRAINING_TRIALS)
-        response = requirement.measure(judged)
-        times[known] = response.settling_time if response.settled >= 0.5 else math.inf
         ratio = abs(math.log(max(times[known], 1e-3) / requirement.aim()))
         if ratio < smallest:
-            smallest, name, files, judgement = ratio, known, found, judged
+            smallest, name, (policy, record), judgement = ratio, known, found, judged
     task = dataclasses.replace(tasks[name], name=f"{tasks[name].name}-tuned-{requirement.settling_time:g}s")
     return Start(
         name=name,
         task=_prepared(task, requirement, trainer, True, tuple(edits)),
         first=_prepared(task, requirement, trainer, False, tuple(edits)),
-        files=files,
+        policy=policy,
+        record=record,
+        setting=dialled.setting if dialled is not None and name == DIAL else {},
         judgement=judgement,
         times=times,
     )
 
 
-def fly_for(requirement: Requirement, policy: Policy, task: Task, seed: int, trials: int) -> Judgement:
-    """The judgement of a policy on trials that are long enough for the requirement."""
-    return judge(fly(policy, task, trials=trials, seed=seed, duration=requirement.trial_duration()))
+def _time(response: ResponseSummary) -> float:
+    """The settling time in s, infinite where fewer than half of the trials settle."""
+    return response.settling_time if response.settled >= 0.5 else math.inf
 
 
 def _prepared(task: Task, requirement: Requirement, trainer: str, warm_start: bool, fixed: tuple[str, ...]) -> Task:

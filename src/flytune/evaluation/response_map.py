@@ -1,0 +1,199 @@
+"""The response map of a policy with a dial: what response each setting gives, and which setting gives a response."""
+
+import dataclasses
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from flytune.control.policy import Policy
+from flytune.errors import BadInput
+from flytune.evaluation.fly import fly
+from flytune.evaluation.judge import AXES, Judgement, judge
+from flytune.evaluation.statistics import bootstrap_interval, median, quantile
+from flytune.tables import Column, Table, number
+from flytune.task.task import Task
+
+SETTINGS, TRIALS, SEED = 20, 100, 2000  # no training, tuning or evaluation flies these initial conditions
+LEAST_SETTLED = 0.95  # of the feasible trials; at a setting with fewer, the map gives no answer
+
+
+COLUMNS = (
+    Column("settled", lambda row: row["settled"]),
+    Column("median", lambda row: row["time"]["median"], group="settling time [s]", decimals=2),
+    Column("95 % interval", lambda row: _between(row["time"]), group="settling time [s]"),
+    Column("overshoot p90 [%]", lambda row: row["overshoot"], decimals=1, scale=100.0),
+    Column("error [mm]", lambda row: row["error"]["median"], decimals=1, scale=1e3),
+    Column("median", lambda row: row["speed"]["median"], group="peak speed [m/s]", decimals=2),
+    Column("p95", lambda row: row["speed"]["p95"], group="peak speed [m/s]", decimals=2),
+)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class ResponseMap:
+    """The measured response along one dial, all other dials at their defaults. Every list has one entry per setting."""
+
+    dial: str
+    unit: str
+    trials: int  # per setting
+    seed: int
+    values: list[float]  # of the dial, rising
+    settled: list[int]  # trials whose position settled
+    settling_time: list[dict[str, float | None]]  # of the position, s: median, and its 95 % interval low, high
+    overshoot: list[float | None]  # of the position, 90th percentile, share of the step
+    steady_state_error: list[dict[str, float | None]]  # of the position, m: median, low, high
+    peak_speed: list[dict[str, float | None]]  # m/s: median, p95
+    monotone: list[float | None]  # s, the settling times made monotone; None where too few trials settle
+
+    def table(self) -> str:
+        """The map for a terminal: one row per setting."""
+        unit = f" [{self.unit}]" if self.unit else ""
+        rows = [
+            {
+                "value": value, "settled": f"{settled}/{self.trials}", "time": time, "overshoot": overshoot,
+                "error": error, "speed": speed,
+            }
+            for value, settled, time, overshoot, error, speed in zip(
+                self.values, self.settled, self.settling_time, self.overshoot, self.steady_state_error,
+                self.peak_speed, strict=True,
+            )
+        ]  # fmt: skip
+        columns = [Column(f"{self.dial}{unit}", lambda row: row["value"], decimals=3), *COLUMNS]
+        return Table.of(columns, rows).text()
+
+    def setting_for(self, settling_time: float) -> float:
+        """The value of the dial whose median settling time is nearest to the one wanted in s, by the monotone curve.
+
+        Between two settings, the curve is a line in the logarithms of value and time.
+        """
+        values, times = self._curve()
+        order = np.argsort(times)
+        return float(np.exp(np.interp(np.log(settling_time), times[order], values[order])))
+
+    def slope(self) -> float:
+        """d log(settling time) / d log(value), over the whole range."""
+        values, times = self._curve()
+        return float((times[-1] - times[0]) / (values[-1] - values[0]))
+
+    def covers(self, settling_time: float) -> bool:
+        """Whether the settling time in s lies between the shortest and the longest of the curve."""
+        _, times = self._curve()
+        return bool(times.min() <= np.log(settling_time) <= times.max())
+
+    def _curve(self) -> tuple[np.ndarray, np.ndarray]:
+        """The logarithms of value and settling time of all settings that settle."""
+        known = [(value, time) for value, time in zip(self.values, self.monotone, strict=True) if time is not None]
+        if len(known) < 2:
+            raise BadInput(f"dial {self.dial}: fewer than two settings settle. Train the policy longer.")
+        values, times = np.log(np.asarray(known, float)).T
+        return values, times
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values, for the header of a policy's file."""
+        return dataclasses.asdict(self)
+
+    @classmethod
+    def read(cls, data: Mapping[str, Any]) -> "ResponseMap":
+        """The map of a policy's header.
+
+        Raises:
+            BadInput: it is not a map.
+        """
+        try:
+            found = cls(**data)
+            found._curve()
+            return found
+        except (TypeError, ValueError, AttributeError):
+            raise BadInput("map: the response map of the policy is damaged. Measure it again: `flytune map`.") from None
+
+
+def measure_map(
+    policy: Policy, task: Task, dial: str | None = None, *, settings: int = SETTINGS, trials: int = TRIALS
+) -> ResponseMap:
+    """The response map of a policy along one of its dials, measured in flight.
+
+    Args:
+        policy: with dials.
+        task: the task of its training.
+        dial: the name of the dial; the first one where None.
+        settings: number of values, even in the spacing of the dial.
+        trials: flights for each value.
+
+    Raises:
+        BadInput: the policy has no such dial.
+    """
+    name = dial or next(iter(policy.dials), "")
+    if name not in policy.dials:
+        raise BadInput(f"dial: {name!r} is no dial of this policy. Allowed: {', '.join(policy.dials) or 'none'}.")
+    values = policy.dials[name].grid(settings)
+    judged = [judge(fly(policy.at({name: value}), task, trials=trials, seed=SEED)) for value in values]
+    return ResponseMap(
+        dial=name,
+        unit=policy.dials[name].unit,
+        trials=trials,
+        seed=SEED,
+        values=values,
+        settled=[each.settled("position") for each in judged],
+        settling_time=[_interval(each.settling_time["position"]) for each in judged],
+        overshoot=[quantile(each.overshoot["position"], 0.9) for each in judged],
+        steady_state_error=[_interval(each.steady_state_error["position"]) for each in judged],
+        peak_speed=[{"median": median(each.peak_speed), "p95": quantile(each.peak_speed, 0.95)} for each in judged],
+        monotone=_monotone([_time(each) for each in judged]),
+    )
+
+
+def response_map(policy: Policy, dial: str | None = None) -> ResponseMap | None:
+    """The response map that a policy carries along a dial, the first one where None; None where it carries none."""
+    name = dial or next(iter(policy.maps), "")
+    return ResponseMap.read(policy.maps[name]) if name in policy.maps else None
+
+
+def with_maps(policy: Policy, task: Task) -> Policy:
+    """The policy with the response map of each of its dials, measured now."""
+    maps = {name: measure_map(policy, task, name).to_dict() for name in policy.dials}
+    return dataclasses.replace(policy, maps=maps)
+
+
+def settled_everywhere(judgement: Judgement) -> float:
+    """The share of the feasible trials that settle on every axis."""
+    settled = np.all([np.isfinite(judgement.settling_time[axis]) for axis in AXES], axis=0)
+    feasible = ~judgement.infeasible
+    return float(np.mean(settled[feasible])) if feasible.any() else 0.0
+
+
+def _time(judgement: Judgement) -> float | None:
+    return median(judgement.settling_time["position"]) if settled_everywhere(judgement) >= LEAST_SETTLED else None
+
+
+def _between(time: Mapping[str, float | None]) -> str:
+    return f"{number(time['low'], 2)} to {number(time['high'], 2)}"
+
+
+def _interval(values: np.ndarray) -> dict[str, float | None]:
+    low, high = bootstrap_interval([values], number=500)
+    return {"median": median(values), "low": low, "high": high}
+
+
+def _monotone(times: list[float | None]) -> list[float | None]:
+    """The times made monotone by the pool-adjacent-violators algorithm on their logarithms; None stays.
+
+    Whether they rise or fall is decided by the first and the last.
+
+    Source: Barlow et al., Statistical inference under order restrictions (1972).
+    """
+    known = {index: time for index, time in enumerate(times) if time is not None}
+    if len(known) < 2:
+        return times
+    logarithms = np.log(list(known.values()))
+    sign = 1.0 if logarithms[-1] >= logarithms[0] else -1.0
+    pools: list[tuple[float, int]] = []  # mean and size
+    for value in sign * logarithms:
+        pools.append((float(value), 1))
+        while len(pools) > 1 and pools[-2][0] > pools[-1][0]:
+            (first, n), (second, m) = pools[-2:]
+            pools[-2:] = [((first * n + second * m) / (n + m), n + m)]
+    smooth = np.exp(sign * np.concatenate([np.full(size, mean) for mean, size in pools]))
+    result = list(times)
+    for index, value in zip(known, smooth, strict=True):
+        result[index] = float(value)
+    return result

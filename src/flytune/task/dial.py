@@ -1,0 +1,135 @@
+"""Dials: numbers that a controller is told, and that fields of its task follow. One policy then has many responses."""
+
+import dataclasses
+import math
+from collections.abc import Mapping
+from typing import Annotated, Any, Literal
+
+import jax
+import jax.numpy as jnp
+from annotated_types import Ge, Le, Unit
+from jaxtyping import Array, Float
+
+from flytune.config.document import Real
+from flytune.config.formula import Formula
+from flytune.config.pytree import label, pytree, static
+from flytune.errors import BadInput
+from flytune.task.observation import BLOCK_NAMES, BLOCKS
+
+Setting = Mapping[str, Any]  # dial -> its value
+TOLERANCE = 1e-6  # share of a range, by which rounding may exceed it
+
+
+@pytree
+class Dial:
+    """A number that may be set at any time, also in flight. In training it is drawn at random for each episode."""
+
+    lowest: Annotated[Real, Unit("see unit")]
+    highest: Annotated[Real, Unit("see unit")]
+    default: Annotated[Real, Unit("see unit")]
+    spacing: Literal["linear", "logarithmic"] = static(default="linear")  # drawn evenly in the value or its logarithm
+    turned: Annotated[Real, Ge(0), Le(1), Unit("1")] = 0.0  # share of the episodes in which each update turns it
+    unit: str = label(default="")
+    meaning: str = label(default="")
+
+    def problem(self) -> str | None:
+        """What makes the numbers impossible together, or None."""
+        if not self.lowest < self.highest:
+            return f"lowest: {self.lowest} is not below highest. Allowed: below {self.highest}."
+        if not self.lowest <= self.default <= self.highest:
+            return f"default: {self.default} is out of range. Allowed: {self.lowest} to {self.highest}."
+        if self.spacing == "logarithmic" and self.lowest <= 0:
+            return f"lowest: {self.lowest} has no logarithm. Allowed: above 0, or spacing linear."
+        return None
+
+    def at(self, share: Any) -> Any:
+        """The value at a share of the range, from 0 at `lowest` to 1 at `highest`, by the spacing; of any arrays."""
+        xp: Any = jnp if isinstance(share, jax.Array) else math
+        if self.spacing == "linear":
+            return self.lowest + (self.highest - self.lowest) * share
+        return self.lowest * xp.exp(xp.log(self.highest / self.lowest) * share)
+
+    def draw(self, key: jax.Array) -> jax.Array:
+        """A random value, even in the spacing."""
+        return self.at(jax.random.uniform(key, ()))
+
+    def grid(self, number: int) -> list[float]:
+        """Values from `lowest` to `highest`, both included, even in the spacing."""
+        inner = [float(self.at(index / (number - 1))) for index in range(1, number - 1)]
+        return [float(self.lowest), *inner, float(self.highest)]
+
+
+@pytree
+class Input:
+    """Something that the controller is told beside its observation.
+
+    It is the value of a formula of the dials; or, with `of`, a block of the observation times this value.
+    """
+
+    of: Literal["", "position_error", "attitude_error", "velocity", "body_rate", "last_action"] = static(default="")
+    value: Formula = static()
+
+    @property
+    def size(self) -> int:
+        """The number of inputs of a network that it makes."""
+        return BLOCKS[BLOCK_NAMES.index(self.of)] if self.of else 1
+
+    def rows(self) -> slice:
+        """The place of the block in the observation."""
+        first = sum(BLOCKS[: BLOCK_NAMES.index(self.of)])
+        return slice(first, first + self.size)
+
+
+def told(
+    inputs: Mapping[str, Input], observation: Float[Array, "*batch 17"], setting: Setting
+) -> Float[Array, "*batch _"]:
+    """The observation, and behind it all further inputs in the order of their names."""
+    parts = [observation]
+    for name in sorted(inputs):
+        value = jnp.asarray(inputs[name].value.value(setting), observation.dtype)[..., None]
+        block = observation[..., inputs[name].rows()] if inputs[name].of else jnp.ones_like(observation[..., :1])
+        parts.append(value * block)
+    return jnp.concatenate(parts, axis=-1) if inputs else observation
+
+
+def number_of_inputs(inputs: Mapping[str, Input]) -> int:
+    """How many numbers `told` puts behind the observation."""
+    return sum(each.size for each in inputs.values())
+
+
+def checked_setting(dials: Mapping[str, Dial], setting: Setting, where: str = "dial") -> dict[str, float]:
+    """The value of every dial: as set, else its default.
+
+    Raises:
+        BadInput: an unknown dial, or a value that is no number or out of range.
+    """
+    values = {name: float(dial.default) for name, dial in dials.items()}
+    for name, value in setting.items():
+        if name not in dials:
+            allowed = f"Allowed: {', '.join(dials)}" if dials else "This one has no dial"
+            raise BadInput(f"{where}: {name!r} is no dial here. {allowed}.")
+        dial, number = dials[name], isinstance(value, int | float) and not isinstance(value, bool)
+        room = TOLERANCE * abs(dial.highest - dial.lowest)
+        if not number or not dial.lowest - room <= value <= dial.highest + room:
+            unit = f" {dial.unit}" if dial.unit else ""
+            raise BadInput(
+                f"{where}: {name}={value} is not allowed. Allowed: {dial.lowest:g} to {dial.highest:g}{unit}."
+            )
+        values[name] = min(max(float(value), float(dial.lowest)), float(dial.highest))
+    return values
+
+
+def with_field(node: Any, path: tuple[str, ...], value: Any) -> Any:
+    """The dataclass or dict with the field at a path replaced.
+
+    Raises:
+        KeyError: there is no such field.
+    """
+    if not path:
+        return value
+    name, *rest = path
+    if isinstance(node, Mapping):
+        return {**node, name: with_field(node[name], tuple(rest), value)}
+    if not dataclasses.is_dataclass(node) or name not in {field.name for field in dataclasses.fields(node)}:
+        raise KeyError(name)
+    return dataclasses.replace(node, **{name: with_field(getattr(node, name), tuple(rest), value)})  # pyright: ignore

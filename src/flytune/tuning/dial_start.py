@@ -1,0 +1,88 @@
+"""A start without training: the policy with a dial that ships, at the setting that is nearest to a requirement."""
+
+import dataclasses
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from flytune.control.policy import Policy, load_policy
+from flytune.errors import BadInput
+from flytune.evaluation.judge import Judgement
+from flytune.evaluation.response_map import response_map
+from flytune.runs.shipped import shipped_files, shipped_name, shipped_names
+from flytune.task.task import Task, load_task, write_task
+from flytune.tuning.flying import fly_for
+from flytune.tuning.history import TRAINING_SEED, TRAINING_TRIALS
+from flytune.tuning.requirement import Requirement, ResponseSummary
+
+DIAL = "dial"  # the task of the policy
+MOST_TURNS = 3  # of the dial, each with a flight of the training set
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class DialStart:
+    """A setting of the dial: the task and the policy that it stands for, both without a dial, and how it flies."""
+
+    setting: dict[str, float]
+    task: Task
+    policy: Policy
+    record: Path  # run.json of the training
+    judgement: Judgement  # on the training set
+    response: ResponseSummary
+    flights: int  # how often the dial was turned
+
+
+def find_setting(requirement: Requirement, edits: Mapping[str, Any], trainer: str) -> DialStart | None:
+    """The setting of the dial whose response is nearest to a requirement on the training set.
+
+    The first setting is read from the response map that the policy carries. Where its response misses the requirement,
+    the dial is turned further by the slope of the map. None where no policy with a dial ships for this trainer, or
+    where a field that the user has set follows the dial or does not exist in its task.
+    """
+    name = shipped_name(DIAL, trainer)
+    if name not in shipped_names():
+        return None
+    try:
+        family = load_task(DIAL, dict(edits))
+    except BadInput:
+        return None
+    file, record = shipped_files(name)
+    policy = load_policy(file)
+    known = response_map(policy)
+    if known is None:
+        return None
+    target, aim, dial = requirement.tightened(), requirement.aim(), policy.dials[known.dial]
+    value, best = known.setting_for(aim), None
+    for turn in range(1, MOST_TURNS + 1):
+        value = float(f"{min(max(value, dial.lowest), dial.highest):.4g}")
+        start = _flown(requirement, family, policy, {known.dial: value}, record, turn)
+        if best is None or target.distance(start.response) < target.distance(best.response):
+            best = start
+        measured = start.response.settling_time
+        if not target.misses(start.response) or not math.isfinite(measured) or measured <= 0:
+            break
+        further = value * (aim / measured) ** (1 / known.slope())
+        if abs(math.log(min(max(further, dial.lowest), dial.highest) / value)) < 0.002:
+            break
+        value = further
+    return best
+
+
+def _flown(
+    requirement: Requirement, family: Task, policy: Policy, setting: dict[str, float], record: Path, turn: int
+) -> DialStart:
+    """One setting, flown on the training set."""
+    task, fixed = family.at(setting), policy.at(setting).fixed()
+    words = ", ".join(f"{name}={value:g}" for name, value in setting.items())
+    fixed = dataclasses.replace(fixed, about={**fixed.about, "dial": words, "task_toml": write_task(task)})
+    judgement = fly_for(requirement, fixed, task, TRAINING_SEED, TRAINING_TRIALS)
+    return DialStart(
+        setting=setting,
+        task=task,
+        policy=fixed,
+        record=record,
+        judgement=judgement,
+        response=requirement.measure(judgement),
+        flights=turn,
+    )
