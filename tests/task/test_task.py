@@ -56,7 +56,7 @@ def refusal(task="baseline", **edits):
 
 
 def test_the_three_presets_of_the_paper_ship_each_with_a_refined_one():
-    assert preset_names() == sorted([*PAPER_REWARDS, *(f"{name}-refined" for name in PAPER_REWARDS)])
+    assert preset_names() == sorted([*PAPER_REWARDS, *(f"{name}-refined" for name in PAPER_REWARDS), "dial"])
 
 
 @pytest.mark.parametrize("preset", PAPER_REWARDS)
@@ -198,7 +198,8 @@ def test_a_term_may_be_added_and_needs_to_be_complete():
 def test_an_unknown_preset_is_refused_with_the_nearest_name():
     text = refusal("baselin")
     allowed = (
-        "acrobatic, acrobatic-refined, baseline, baseline-refined, inspection, inspection-refined, or a .toml file."
+        "acrobatic, acrobatic-refined, baseline, baseline-refined, dial, inspection, inspection-refined, or a .toml "
+        "file."
     )
     assert text.startswith(f"task: 'baselin' is no preset. Allowed: {allowed}")
     assert text.endswith("Did you mean baseline?")

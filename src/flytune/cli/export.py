@@ -1,7 +1,7 @@
 """`flytune export`."""
 
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from cyclopts import Parameter
 
@@ -10,7 +10,9 @@ from flytune.config.files import check_file
 PolicyName = Annotated[
     str,
     Parameter(
-        name="CONTROLLER", help="a run directory, a policy file (.safetensors, .onnx, .zip), or a policy that ships"
+        name="CONTROLLER",
+        help="a run directory, a policy file (.safetensors, .onnx, .zip), or a policy that ships; with a setting of "
+        "its dials (dial@speed=0.5), the policy of this setting alone",
     ),
 ]
 Format = Annotated[
@@ -23,7 +25,9 @@ File = Annotated[Path, Parameter(name="--out", metavar="PATH", help="the file")]
 def export(controller: PolicyName, /, *, file_format: Format, out: File) -> None:
     """Write a policy for use outside flytune."""
     from flytune.export import export_policy
-    from flytune.runs.find import find_controller
+    from flytune.runs.find import find_controller, split_setting
 
     check_file(out)
-    print(export_policy(find_controller(controller), out, file_format))
+    found: Any = find_controller(controller)
+    has_setting = bool(split_setting(controller)[1])
+    print(export_policy(found.controller.fixed() if has_setting else found, out, file_format))

@@ -7,11 +7,12 @@ code.
 import ast
 import math
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import Any, TypeVar
 
 import jax
 from pydantic_core import core_schema
 
+T = TypeVar("T")
 LONGEST, DEEPEST = 200, 20  # characters, and operations inside each other: files may come from anyone
 OPERATORS: dict[type, str] = {ast.Add: "+", ast.Sub: "-", ast.Mult: "*", ast.Div: "/", ast.Pow: "**"}
 FUNCTIONS = {"min": 2, "max": 2, "exp": 1, "log": 1, "sqrt": 1}  # name -> number of arguments
@@ -54,6 +55,25 @@ class Formula(str):
 
         return _walk(_parse(self), number, _plain if plain else _traced)
 
+    def build(self, number: Callable[[str], T], operation: Callable[..., T], constant: Callable[[float], T]) -> T:
+        """The value in another language, for instance a node of a graph.
+
+        Args:
+            number: the value of a name.
+            operation: of a name in `OPERATORS` or `FUNCTIONS` and values. A power comes as exp, * and log.
+            constant: the value of a number.
+
+        Raises:
+            ValueError: it is not a formula.
+        """
+
+        def apply(name: str, *values: T) -> T:
+            if name == "**":
+                return operation("exp", operation("*", values[1], operation("log", values[0])))
+            return operation(name, *values)
+
+        return _walk(_parse(self), number, apply, constant)
+
 
 def _parse(text: str) -> ast.expr:
     if len(text) > LONGEST:
@@ -64,23 +84,29 @@ def _parse(text: str) -> ast.expr:
         raise ValueError(f"it is not a formula, allowed: {ALLOWED}") from None
 
 
-def _walk(node: ast.expr, number: Callable[[str], Any], apply: Callable[..., Any], depth: int = 0) -> Any:
+def _walk(
+    node: ast.expr,
+    number: Callable[[str], Any],
+    apply: Callable[..., Any],
+    constant: Callable[[float], Any] = float,
+    depth: int = 0,
+) -> Any:
     """The value of a tree, where `number` gives that of a name and `apply` that of an operation."""
     if depth > DEEPEST:
         raise ValueError(f"more than {DEEPEST} operations lie inside each other")
 
     def inner(child: ast.expr) -> Any:
-        return _walk(child, number, apply, depth + 1)
+        return _walk(child, number, apply, constant, depth + 1)
 
     match node:
         case ast.Constant(value=int() | float() as value) if not isinstance(value, bool) and math.isfinite(value):
-            return float(value)
+            return constant(float(value))
         case ast.Name(id=name):
             return number(name)
         case ast.BinOp(left=left, op=operator, right=right) if type(operator) in OPERATORS:
             return apply(OPERATORS[type(operator)], inner(left), inner(right))
         case ast.UnaryOp(op=ast.USub(), operand=operand):
-            return apply("-", 0.0, inner(operand))
+            return apply("-", constant(0.0), inner(operand))
         case ast.Call(func=ast.Name(id=name), args=arguments, keywords=[]) if FUNCTIONS.get(name) == len(arguments):
             return apply(name, *map(inner, arguments))
     raise ValueError(f"{ast.unparse(node)} is not allowed, allowed: {ALLOWED}")

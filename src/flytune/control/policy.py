@@ -117,12 +117,12 @@ class Policy:
         weight, place = first[:SIZE], SIZE
         for name in sorted(self.inputs):
             each = self.inputs[name]
-            value, rows = each.value.value(self.setting), first[place : place + each.size]
+            value, mine = each.value.value(self.setting), first[place : place + each.size]
             place += each.size
-            if each.of:
-                weight = weight.at[each.rows()].add(value * rows / self.input_scale[each.rows(), None])
+            if (rows := each.rows()) is None:
+                bias = bias + value * mine[0]
             else:
-                bias = bias + value * rows[0]
+                weight = weight.at[rows].add(value * mine / self.input_scale[rows, None])
         actor = Network(weights=(weight, *others), biases=(bias, *biases))
         return dataclasses.replace(self, actor=actor, dials={}, inputs={}, setting={}, maps={})
 

@@ -2,26 +2,47 @@
 
 import itertools
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, Protocol
 
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
 from flytune.config.pytree import pytree
-from flytune.control.policy import Policy
 from flytune.errors import BadInput
 from flytune.physics.dynamics import CONTROL_PERIOD
-from flytune.task.dial import Dial, checked_setting
+from flytune.task.dial import Dial, Setting, checked_setting
 
 Schedule = Mapping[str, Any]  # dial -> its value; or [[time in s, value], ...], the first at 0
+
+
+class Dialled(Protocol):
+    """A controller with dials: a `Policy`, or one that runs the file of another program."""
+
+    @property
+    def dials(self) -> dict[str, Dial]:
+        """Its dials."""
+        ...
+
+    @property
+    def setting(self) -> dict[str, Any]:
+        """The value of each."""
+        ...
+
+    def at(self, setting: Setting | None = None, /) -> Any:
+        """The controller at another setting."""
+        ...
+
+    def __call__(self, observation: Float[Array, "17"], setting: Setting | None = None) -> Float[Array, "4"]:
+        """The action for one observation, at a setting."""
+        ...
 
 
 @pytree
 class ScheduledPolicy:
     """A policy that sets its dials by a schedule; its memory is the number of steps since the start."""
 
-    policy: Policy
+    policy: Dialled
     first_steps: dict[str, Int[Array, "_"]]  # dial -> the control step from which each of its values holds
     values: dict[str, Float[Array, "_"]]
 
@@ -50,7 +71,7 @@ class ScheduledPolicy:
         return setting
 
 
-def with_schedule(policy: Policy, schedule: Schedule) -> Policy | ScheduledPolicy:
+def with_schedule(policy: Dialled, schedule: Schedule) -> Any:
     """The policy at a setting, or with its dials turned at given times.
 
     Args:

@@ -1,23 +1,30 @@
 """Policies as ONNX files: `save_onnx` writes them, `load_onnx` reads them.
 
-The graph has one input `observation`, float32 [batch, 17], and one output `action`, float32 [batch, 4] in [-1, 1]. It
-contains the scaling of the observation and the squashing of the action. The metadata says what the numbers mean, and
-for which task and vehicle the policy was trained.
+The graph has one input `observation`, float32 [batch, 17], and one output `action`, float32 [batch, 4] in [-1, 1]. A
+policy with dials has a second input `dial`, float32 [batch, dials], in the order of their names. The graph contains the
+scaling of the observation and the squashing of the action. The metadata says what the numbers mean, and for which task
+and vehicle the policy was trained.
 """
 
+import itertools
+import json
+from collections.abc import Callable
 from importlib import metadata
 from pathlib import Path
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from flytune.config import document
 from flytune.config.files import write_bytes
 from flytune.control.policy import CONVENTIONS, Policy
 from flytune.errors import BadInput, require
 from flytune.export.untrusted.onnx_controller import OnnxController, load_onnx, read_onnx, sample_observations
-from flytune.export.untrusted.onnx_inspection import FORMAT, INPUT, OUTPUT, VERSION
+from flytune.export.untrusted.onnx_inspection import DIAL_INPUT, DIALS, FORMAT, INPUT, OUTPUT, VERSION
+from flytune.task.dial import Dial, told
 from flytune.task.observation import SIZE
 
 __all__ = ["CONVENTIONS", "OnnxController", "check_actions", "load_onnx", "rounding_bound", "save_onnx"]
@@ -26,6 +33,7 @@ __all__ = ["CONVENTIONS", "OnnxController", "check_actions", "load_onnx", "round
 OPERATOR_SET, INTERMEDIATE_REPRESENTATION = 13, 7
 CHECKED = 10_000  # observations for which the file must give the actions of the policy
 UNIT_ROUNDOFF = 2.0**-24  # of float32
+FORMULA_ERROR = 32 * UNIT_ROUNDOFF  # of an input that a formula gives: each of its few operations rounds
 TANH_ERROR = 8 * UNIT_ROUNDOFF  # measured: 5.5 in onnxruntime 1.32, 4.6 in XLA, over all of [-12, 12]
 
 
@@ -53,6 +61,10 @@ def rounding_bound(policy: Policy, observations: Float[np.ndarray, "batch 17"]) 
     """
     x = observations.astype(float) * np.asarray(policy.input_scale, float)
     error = UNIT_ROUNDOFF * np.abs(x)
+    if policy.inputs:
+        further = np.asarray(told(policy.inputs, jnp.asarray(observations), policy.setting), float)[:, SIZE:]
+        x = np.concatenate([x, further], axis=-1)
+        error = np.concatenate([error, FORMULA_ERROR * np.abs(further)], axis=-1)
     last = len(policy.actor.weights) - 1
     for index, (weight, bias) in enumerate(zip(policy.actor.weights, policy.actor.biases, strict=True)):
         w, b = np.asarray(weight, float), np.asarray(bias, float)
@@ -74,15 +86,26 @@ def check_actions(controller: OnnxController, policy: Policy, where: str) -> Non
         BadInput: an action differs; the message begins with `where`, the name of the file.
     """
     observations = sample_observations(CHECKED)
-    difference = np.abs(controller.session(observations) - np.asarray(jax.jit(policy.__call__)(observations)))
-    allowed = 2 * rounding_bound(policy, observations)  # each of the two actions may have this error
-    if not np.all(difference <= allowed):
-        row, motor = np.unravel_index(np.argmax(difference - allowed), difference.shape)
-        raise BadInput(
-            f"{where}: for sample observation {row}, the action of onnxruntime differs from that of the policy by "
-            f"{difference[row, motor]:.2g} at motor {motor}. Allowed: {allowed[row, motor]:.2g}, the rounding of "
-            "float32. Nothing was written; try another version of onnxruntime."
-        )
+    for setting in checked_settings(policy.dials):
+        here = policy.at(setting)
+        found = controller.session(observations, np.asarray([list(setting.values())], np.float32))
+        difference = np.abs(found - np.asarray(jax.jit(here.__call__)(observations)))
+        allowed = 2 * rounding_bound(here, observations)  # each of the two actions may have this error
+        if not np.all(difference <= allowed):
+            row, motor = np.unravel_index(np.argmax(difference - allowed), difference.shape)
+            raise BadInput(
+                f"{where}: for sample observation {row}, the action of onnxruntime differs from that of the policy by "
+                f"{difference[row, motor]:.2g} at motor {motor}. Allowed: {allowed[row, motor]:.2g}, the rounding of "
+                "float32. Nothing was written; try another version of onnxruntime."
+            )
+
+
+def checked_settings(dials: dict[str, Dial]) -> list[dict[str, float]]:
+    """The settings at which a file is checked: all dials at their lowest, default and highest value."""
+    if not dials:
+        return [{}]
+    ends = ("lowest", "default", "highest")
+    return [{name: float(getattr(dials[name], end)) for name in sorted(dials)} for end in ends]
 
 
 def _model(policy: Policy) -> Any:
@@ -90,15 +113,17 @@ def _model(policy: Policy) -> Any:
     helper = onnx.helper
     nodes, weights = [], []
 
-    def weight(name: str, values: Any) -> str:
-        weights.append(onnx.numpy_helper.from_array(np.asarray(values, np.float32), name))
+    def weight(name: str, values: Any, kind: Any = np.float32) -> str:
+        weights.append(onnx.numpy_helper.from_array(np.asarray(values, kind), name))
         return name
 
-    def node(operator: str, *inputs: str, output: str) -> str:
-        nodes.append(helper.make_node(operator, inputs, [output], name=output))
+    def node(operator: str, *inputs: str, output: str, **attributes: int) -> str:
+        nodes.append(helper.make_node(operator, inputs, [output], name=output, **attributes))
         return output
 
     value = node("Mul", INPUT, weight("input_scale", policy.input_scale), output="scaled")
+    if policy.inputs:
+        value = node("Concat", value, *_further_inputs(policy, node, weight), output="inputs", axis=1)
     last = len(policy.actor.weights) - 1
     for index, (matrix, bias) in enumerate(zip(policy.actor.weights, policy.actor.biases, strict=True)):
         layer = f"actor.{index}"
@@ -111,7 +136,11 @@ def _model(policy: Policy) -> Any:
     graph = helper.make_graph(
         nodes,
         "policy",
-        [helper.make_tensor_value_info(INPUT, onnx.TensorProto.FLOAT, ["batch", SIZE])],
+        [
+            helper.make_tensor_value_info(name, onnx.TensorProto.FLOAT, ["batch", size])
+            for name, size in ((INPUT, SIZE), (DIAL_INPUT, len(policy.dials)))
+            if size
+        ],
         [helper.make_tensor_value_info(OUTPUT, onnx.TensorProto.FLOAT, ["batch", 4])],
         weights,
     )
@@ -123,6 +152,38 @@ def _model(policy: Policy) -> Any:
         producer_version=metadata.version("flytune"),
     )
     about = {key: str(value) for key, value in policy.about.items()}
+    if policy.dials:
+        about[DIALS] = json.dumps({name: document.plain(policy.dials[name]) for name in sorted(policy.dials)})
     facts = {FORMAT: "flytune-onnx-1", VERSION: metadata.version("flytune")}
     helper.set_model_props(model, about | CONVENTIONS | facts)
     return model
+
+
+def _further_inputs(policy: Policy, node: Callable[..., str], weight: Callable[..., str]) -> list[str]:
+    """The inputs of the network behind the observation, each [batch, its size], as nodes of the graph."""
+    count = itertools.count()
+    operators = {"+": "Add", "-": "Sub", "*": "Mul", "/": "Div"}
+
+    def operation(name: str, *values: str) -> str:
+        return node(operators.get(name, name.capitalize()), *values, output=f"formula.{next(count)}")
+
+    def constant(value: float) -> str:
+        return weight(f"constant.{next(count)}", [[value]])
+
+    columns = {
+        name: node(
+            "Gather", DIAL_INPUT, weight(f"dial.{name}.column", [index], np.int64), output=f"dial.{name}", axis=1
+        )
+        for index, name in enumerate(sorted(policy.dials))
+    }
+    first = columns[min(policy.dials)]
+    one = node("Exp", node("Sub", first, first, output="zero"), output="one")  # [batch, 1]
+    parts = []
+    for name in sorted(policy.inputs):
+        each, block = policy.inputs[name], one
+        if (rows := each.rows()) is not None:
+            numbers = weight(f"input.{name}.rows", range(SIZE)[rows], np.int64)
+            block = node("Gather", INPUT, numbers, output=f"input.{name}.block", axis=1)
+        value = each.value.build(columns.__getitem__, operation, constant)
+        parts.append(node("Mul", value, block, output=f"input.{name}"))
+    return parts

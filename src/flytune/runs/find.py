@@ -11,7 +11,7 @@ import jax
 from flytune.config import document
 from flytune.control.classical import CLASSICAL, classical_controller
 from flytune.control.controller import Controller
-from flytune.control.policy import Policy, load_policy
+from flytune.control.policy import load_policy
 from flytune.control.schedule import Schedule, with_schedule
 from flytune.errors import BadInput
 from flytune.export.untrusted.onnx_controller import load_onnx
@@ -48,12 +48,13 @@ class FoundController:
         Raises:
             BadInput: the controller has no dial, an unknown dial, or a value out of range.
         """
-        if not isinstance(self.controller, Policy) or not self.controller.dials:
+        controller: Any = self.controller
+        if not getattr(controller, "dials", {}):
             raise BadInput(
                 f"{self.name}: has no dial. Allowed: a policy with dials, for instance dial@speed=0.5; "
                 "`flytune train dial` trains one."
             )
-        return dataclasses.replace(self, controller=with_schedule(self.controller, schedule), name=name or self.name)
+        return dataclasses.replace(self, controller=with_schedule(controller, schedule), name=name or self.name)
 
     def __repr__(self) -> str:
         return f"FoundController({self.name}, {self.controller!r}, for {self.task.name})"
@@ -79,10 +80,9 @@ def find_controller(name: str, task: str | Task | None = None) -> FoundControlle
         BadInput: no controller has this name, or it cannot be used.
     """
     wanted = load_task(task) if isinstance(task, str) else task
-    base, at, setting = name.rpartition("@")
-    if at and "=" in setting and not os.path.exists(name):
-        found = find_controller(base, wanted)
-        return found.with_dial(dict(map(document.parse_assignment, setting.split(","))), name)
+    base, setting = split_setting(name)
+    if setting:
+        return find_controller(base, wanted).with_dial(setting, name)
     path = Path(name)
     if os.path.isdir(name):  # unlike Path.is_dir, also where the name is too long to be one
         return _from_run(name, path, wanted)
@@ -97,6 +97,14 @@ def find_controller(name: str, task: str | Task | None = None) -> FoundControlle
     if name in shipped_names():
         return _shipped(name, wanted)
     raise BadInput(f"{name}: no such controller. Allowed: {KINDS}{''.join(f', {name}' for name in shipped_names())}.")
+
+
+def split_setting(name: str) -> tuple[str, dict[str, Any]]:
+    """The name of a controller and the setting of its dials, from a name such as `dial@speed=0.5`."""
+    base, at, setting = name.rpartition("@")
+    if not at or "=" not in setting or os.path.exists(name):
+        return name, {}
+    return base, dict(map(document.parse_assignment, setting.split(",")))
 
 
 def _from_file(name: str, path: Path, wanted: Task | None) -> FoundController:

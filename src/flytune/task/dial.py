@@ -66,16 +66,20 @@ class Input:
     It is the value of a formula of the dials; or, with `of`, a block of the observation times this value.
     """
 
-    of: Literal["", "position_error", "attitude_error", "velocity", "body_rate", "last_action"] = static(default="")
+    of: Literal["none", "position_error", "attitude_error", "velocity", "body_rate", "last_action"] = static(
+        default="none"
+    )
     value: Formula = static()
 
     @property
     def size(self) -> int:
         """The number of inputs of a network that it makes."""
-        return BLOCKS[BLOCK_NAMES.index(self.of)] if self.of else 1
+        return BLOCKS[BLOCK_NAMES.index(self.of)] if self.of in BLOCK_NAMES else 1
 
-    def rows(self) -> slice:
-        """The place of the block in the observation."""
+    def rows(self) -> slice | None:
+        """The place of the block in the observation, None without one."""
+        if self.of not in BLOCK_NAMES:
+            return None
         first = sum(BLOCKS[: BLOCK_NAMES.index(self.of)])
         return slice(first, first + self.size)
 
@@ -86,9 +90,8 @@ def told(
     """The observation, and behind it all further inputs in the order of their names."""
     parts = [observation]
     for name in sorted(inputs):
-        value = jnp.asarray(inputs[name].value.value(setting), observation.dtype)[..., None]
-        block = observation[..., inputs[name].rows()] if inputs[name].of else jnp.ones_like(observation[..., :1])
-        parts.append(value * block)
+        value, rows = jnp.asarray(inputs[name].value.value(setting), observation.dtype)[..., None], inputs[name].rows()
+        parts.append(value * (jnp.ones_like(observation[..., :1]) if rows is None else observation[..., rows]))
     return jnp.concatenate(parts, axis=-1) if inputs else observation
 
 

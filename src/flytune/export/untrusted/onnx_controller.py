@@ -1,5 +1,6 @@
 """A controller that runs the policy of an ONNX file with onnxruntime."""
 
+import dataclasses
 import hashlib
 import os
 from pathlib import Path
@@ -13,7 +14,19 @@ from jaxtyping import Array, Float
 from flytune.config.pytree import label, pytree, static
 from flytune.control.policy import CONVENTIONS
 from flytune.errors import BadInput, require
-from flytune.export.untrusted.onnx_inspection import FORMAT, INPUT, OUTPUT, VERSION, first_line, inspect, metadata
+from flytune.export.untrusted.onnx_inspection import (
+    DIAL_INPUT,
+    DIALS,
+    FORMAT,
+    INPUT,
+    OUTPUT,
+    VERSION,
+    first_line,
+    inspect,
+    metadata,
+    read_dials,
+)
+from flytune.task.dial import Dial, Setting, checked_setting
 from flytune.task.observation import SIZE
 
 LARGEST = 100_000_000  # bytes; the network of the paper takes 25,000
@@ -37,9 +50,14 @@ class Session:
         self._session = onnxruntime.InferenceSession(content, options, providers=["CPUExecutionProvider"])
         self._digest = hashlib.sha256(content).digest()
 
-    def __call__(self, observations: Float[np.ndarray, "batch 17"]) -> Float[np.ndarray, "batch 4"]:
-        """The actions for a batch of observations."""
-        return self._session.run([OUTPUT], {INPUT: np.ascontiguousarray(observations, np.float32)})[0]
+    def __call__(
+        self, observations: Float[np.ndarray, "batch 17"], dial: Float[np.ndarray, "_ dials"] | None = None
+    ) -> Float[np.ndarray, "batch 4"]:
+        """The actions for a batch of observations, at the setting of each, or at one setting of the dials for all."""
+        given = {INPUT: np.ascontiguousarray(observations, np.float32)}
+        if dial is not None and dial.shape[-1]:
+            given[DIAL_INPUT] = np.ascontiguousarray(np.broadcast_to(dial, (len(observations), dial.shape[-1])))
+        return self._session.run([OUTPUT], given)[0]
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, Session) and self._digest == other._digest
@@ -56,7 +74,24 @@ class OnnxController:
     """
 
     session: Session = static()
+    dials: dict[str, Dial] = dataclasses.field(default_factory=dict)
+    setting: dict[str, Any] = dataclasses.field(default_factory=dict)  # dial -> its value
     about: dict[str, str] = label(default_factory=dict)  # the metadata of the file: task, vehicle, ...
+
+    def at(self, setting: Setting | None = None, /, **values: float) -> "OnnxController":
+        """The controller with its dials set; a dial that is not named keeps its value.
+
+        Raises:
+            BadInput: an unknown dial, or a value out of range.
+        """
+        wanted = {**self.setting, **(setting or {}), **values}
+        return dataclasses.replace(self, setting=checked_setting(self.dials, wanted))
+
+    def __call__(self, observation: Float[Array, "17"], setting: Setting | None = None) -> Float[Array, "4"]:
+        """The action for one observation, at a setting; its own where None."""
+        setting, shape = self.setting if setting is None else setting, jax.ShapeDtypeStruct((4,), jnp.float32)
+        dial = jnp.asarray([setting[name] for name in sorted(self.dials)], jnp.float32)
+        return jax.pure_callback(self._answer, shape, observation, dial, vmap_method="broadcast_all")
 
     def initial_memory(self) -> tuple[()]:
         """An empty memory: the policy depends on the current observation only."""
@@ -64,15 +99,16 @@ class OnnxController:
 
     def act(self, memory: tuple[()], observation: Float[Array, "17"]) -> tuple[tuple[()], Float[Array, "4"]]:
         """The action for one observation, see `Controller`."""
-        shape = jax.ShapeDtypeStruct((4,), jnp.float32)
-        return memory, jax.pure_callback(self._answer, shape, observation, vmap_method="broadcast_all")
+        return memory, self(observation)
 
-    def _answer(self, observation: Any) -> np.ndarray:
+    def _answer(self, observation: Any, dial: Any) -> np.ndarray:
         # NumPy only: a call of JAX from here would wait for the compiled program that waits for this function
-        observations = np.asarray(observation)
+        observations, dials = np.asarray(observation), np.asarray(dial)
         shape = (*observations.shape[:-1], 4)
+        rows = observations.reshape(-1, observations.shape[-1])
+        settings = dials.reshape(-1, dials.shape[-1]) if dials.size else None
         try:
-            return np.clip(self.session(observations.reshape(-1, observations.shape[-1])), -1.0, 1.0).reshape(shape)
+            return np.clip(self.session(rows, settings), -1.0, 1.0).reshape(shape)
         except Exception:  # the probe did not cause it; `fly` reports where and when an action is not finite
             return np.full(shape, np.nan, np.float32)
 
@@ -106,15 +142,17 @@ def load_onnx(path: Path) -> OnnxController:
 def read_onnx(content: bytes, where: str) -> OnnxController:
     """A controller from the content of an ONNX file, see `load_onnx`; errors begin with `where`, the file's name."""
     model = inspect(content, where)
+    dials = read_dials(model, where)
+    setting = {name: float(dial.default) for name, dial in dials.items()}
     try:
         session = Session(model.SerializeToString())  # only what was inspected
-        _probe(session, where)
+        _probe(session, np.asarray([list(setting.values())], np.float32), where)
     except BadInput:
         raise
     except Exception as error:  # the exceptions of onnxruntime have no common base
         raise BadInput(f"{where}: onnxruntime cannot run it ({first_line(error)}). Export it again.") from None
-    about = {key: value for key, value in metadata(model).items() if key not in {*CONVENTIONS, FORMAT, VERSION}}
-    return OnnxController(session=session, about=about)
+    about = {key: value for key, value in metadata(model).items() if key not in {*CONVENTIONS, DIALS, FORMAT, VERSION}}
+    return OnnxController(session=session, dials=dials, setting=setting, about=about)
 
 
 def sample_observations(number: int) -> Float[np.ndarray, "number 17"]:
@@ -137,10 +175,10 @@ def sample_observations(number: int) -> Float[np.ndarray, "number 17"]:
     return observations
 
 
-def _probe(session: Session, where: str) -> None:
+def _probe(session: Session, dial: Float[np.ndarray, "1 dials"], where: str) -> None:
     """Refuse a model whose actions have another shape, are out of range, or depend on other rows of the batch."""
     observations = sample_observations(PROBES)
-    actions = session(observations)
+    actions = session(observations, dial)
     if actions.shape != (PROBES, 4):
         raise BadInput(
             f"{where}: gives actions of shape {actions.shape} for {PROBES} observations. Allowed: ({PROBES}, 4)."
@@ -153,7 +191,7 @@ def _probe(session: Session, where: str) -> None:
             "Put the squashing (Clip or Tanh) into the model."
         )
     for index in (0, 1, PROBES - 1):
-        alone = session(observations[index : index + 1])
+        alone = session(observations[index : index + 1], dial)
         if alone.shape != (1, 4) or np.abs(alone[0] - actions[index]).max() > BATCH_TOLERANCE:
             raise BadInput(
                 f"{where}: gives another action for an observation that is alone in its batch. "

@@ -4,17 +4,21 @@ A model may come from an untrusted source. It may name other files for its weigh
 numbers. A policy needs none of these, so only arithmetic that is known to be harmless is allowed.
 """
 
+import json
 import math
 from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
 
+from flytune.config import document
 from flytune.control.policy import CONVENTIONS
 from flytune.errors import BadInput, require
+from flytune.task.dial import Dial
 from flytune.task.observation import SIZE
 
 INPUT, OUTPUT = "observation", "action"
+DIAL_INPUT, DIALS = "dial", "dials"  # a second input, and the metadata entry that describes it, of a policy with dials
 FORMAT, VERSION = "format", "flytune_version"  # metadata entries that say which program wrote the file
 # fmt: off
 OPERATORS = {
@@ -48,7 +52,7 @@ def inspect(content: bytes, where: str) -> Any:
     model.DiscardUnknownFields()  # a field that was not inspected must not be run
     _refuse_other_files(onnx, model, where)
     _refuse_more_than_arithmetic(onnx, model, where)
-    _refuse_other_inputs_and_outputs(onnx, model.graph, where)
+    _refuse_other_inputs_and_outputs(onnx, model, where)
     try:
         onnx.checker.check_model(model, full_check=True)
         inferred = onnx.shape_inference.infer_shapes(model, data_prop=True)
@@ -58,6 +62,22 @@ def inspect(content: bytes, where: str) -> Any:
     _refuse_other_conventions(model, where)
     _refuse_broken_numbers(onnx, model, where)
     return model
+
+
+def read_dials(model: Any, where: str) -> dict[str, Dial]:
+    """The dials of a model in the order of its second input; empty for a model with the observation alone.
+
+    Raises:
+        BadInput: the entry of the metadata is damaged.
+    """
+    try:
+        found = json.loads(metadata(model).get(DIALS, "{}"))
+    except ValueError:
+        found = None
+    if not isinstance(found, dict):
+        raise BadInput(f"{where}: the metadata entry {DIALS!r} is damaged. Export it again.")
+    dials = document.read(dict[str, Dial], found, f"{where}: {DIALS}")
+    return {name: dials[name] for name in sorted(dials)}
 
 
 def metadata(model: Any) -> dict[str, str]:
@@ -105,10 +125,14 @@ def _refuse_more_than_arithmetic(onnx: Any, model: Any, where: str) -> None:
             )
 
 
-def _refuse_other_inputs_and_outputs(onnx: Any, graph: Any, where: str) -> None:
+def _refuse_other_inputs_and_outputs(onnx: Any, model: Any, where: str) -> None:
+    graph, dials = model.graph, len(read_dials(model, where))
     weights = {tensor.name for tensor in graph.initializer}  # old models list weights among the inputs as well
     inputs = [value for value in graph.input if value.name not in weights]
-    for kind, found, name, size in (("input", inputs, INPUT, SIZE), ("output", list(graph.output), OUTPUT, 4)):
+    wanted = [("input", inputs[:1] if dials else inputs, INPUT, SIZE), ("output", list(graph.output), OUTPUT, 4)]
+    if dials:
+        wanted.append(("input", inputs[1:], DIAL_INPUT, dials))
+    for kind, found, name, size in wanted:
         wanted = f"Allowed: one {kind} {name!r}, float32 [batch, {size}]. Export it with this one."
         if [value.name for value in found] != [name]:
             names = ", ".join(_shown(value.name) for value in found) or "none"
