@@ -1,150 +1,178 @@
-"""One policy whose speed bound is an input, trained on a family of tasks through the rollout that every trainer uses.
+"""What docs/results/dial.md says of the policies with a dial, measured again.
 
-    python benchmarks/dial.py [UPDATES] [SEED]
+    python benchmarks/dial.py map RUN [RUN ...]   20 settings of each policy, and what is required of them
+    python benchmarks/dial.py turns [CONTROLLER]  1,000 flights in which the dial is turned at random times
+    python benchmarks/dial.py wishes              `flytune tune` for 30 settling times, in a process each
+    python benchmarks/dial.py price               the policy with a dial beside the policies for one response
 
-The bound of an episode is drawn log-uniformly from 0.2 to 1.6 m/s, and anew for a third of the episodes before each
-update, so that it also changes in flight. The policy sees 21 numbers: the observation, log(bound / 0.6 m/s), and the
-velocity over the bound. 3,000 updates take about five minutes on one core. Prints the response for eight bounds.
+RUN and CONTROLLER are what `flytune evaluate` takes; without it, the policy that ships.
 """
 
-import dataclasses
-import math
+import itertools
 import os
+import subprocess
 import sys
+import tempfile
 import time
-from typing import Any
 
 os.environ.setdefault("XLA_FLAGS", "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1")
 
-import jax
-import jax.numpy as jnp
-import optax
+import numpy as np
 
-from flytune import fly, judge, load_task
-from flytune.config.pytree import pytree
-from flytune.control.policy import make_network
-from flytune.simulation.rollout import Draw, reset_all, rollout
-from flytune.task.observation import NOISY, SIZE, input_scale
-from flytune.training.update import averaged, descend
+from flytune import find_controller, fly, judge, load_task
+from flytune.control.schedule import with_schedule
+from flytune.evaluation.judge import AXES
+from flytune.evaluation.statistics import quantile
 
-UPDATES, SEED = (int(text) for text in (sys.argv[1:] + ["3000", "0"][len(sys.argv) - 1 :])[:2])
-ENVIRONMENTS, WINDOW, SLACK = 64, 400, 0.5
-SLOWEST, FASTEST, BOUNDS = 0.2, 1.6, (0.2, 0.3, 0.45, 0.6, 0.8, 1.0, 1.3, 1.6)  # m/s
-SCALE = input_scale((2.0, 3.0, 2.0, 0.4, 1.0))
+SETTINGS, TRIALS = 20, 100
+SCHEDULES, FLIGHTS, TURNS, DURATION = 50, 20, (2, 7), 20.0  # 1,000 flights of 20 s with 2 to 6 turns each
+WISHES, FASTEST, SLOWEST = 30, 1.6, 11.0  # settling times in s
+SINGLE = {"inspection-refined": 0.2, "baseline-refined": 0.8, "acrobatic-refined": 1.0}
 
 
-def draw_bound(key, shape=()):
-    """Speed bounds in m/s, log-uniform."""
-    return jnp.exp(jax.random.uniform(key, shape, minval=math.log(SLOWEST), maxval=math.log(FASTEST)))
+def feasible_share(judged, good):
+    """The share of the feasible trials that are good, in percent."""
+    return 100 * np.mean(np.asarray(good)[~judged.infeasible])
 
 
-@pytree
-class SpeedFamily:
-    """A task whose speed bound is drawn for each episode; the reward of the velocity follows the bound."""
-
-    task: Any
-
-    def draw(self, key):
-        """The bound of an episode, and the key of its initial state."""
-        bound_key, key = jax.random.split(key)
-        return draw_bound(bound_key), key
-
-    def member(self, bound):
-        """The task with this bound."""
-        sharpness = 1.5 * jnp.maximum((bound / 0.8) ** -1.3, 0.7)
-        changes = {
-            "horizontal": {"weight": 0.25, "wide": 0.4, "narrow": 20.0},
-            "vertical": {"wide": 1.0, "narrow": 60.0},
-            "velocity": {"weight": 0.1, "sharpness": sharpness},
-            "smoothness": {"weight": 0.05},
-        }
-        reward = {name: dataclasses.replace(term, **changes.get(name, {})) for name, term in self.task.reward.items()}
-        speed = dataclasses.replace(self.task.termination["speed"], bound=bound)
-        return dataclasses.replace(self.task, reward=reward, termination={**self.task.termination, "speed": speed})
+def at_setting(policy, task, speed):
+    """The figures of one setting on 100 trials."""
+    judged = judge(fly(policy.at(speed=speed), task, trials=TRIALS, seed=1))
+    settled = np.all([np.isfinite(judged.settling_time[axis]) for axis in AXES], axis=0)
+    return {
+        "speed": speed,
+        "settled": feasible_share(judged, settled),
+        "settling": quantile(judged.settling_time["position"], 0.5),
+        "error": 1e3 * quantile(judged.steady_state_error["position"], 0.5),
+        "overshoot": 100 * quantile(judged.overshoot["position"], 0.9),
+        "of axes": [100 * (quantile(judged.overshoot[axis], 0.9) or 0) for axis in AXES],
+        "kept": feasible_share(judged, ~judged.violated["speed"]),
+        "peak": quantile(judged.peak_speed, 0.5),
+        "variation": float(np.mean(judged.action_total_variation)),
+    }
 
 
-def see(observation, bound):
-    """What the network is given: [17] and a bound become [21]."""
-    dial = jnp.log(bound / 0.6)[..., None]
-    return jnp.concatenate([observation * SCALE, dial, observation[..., 7:10] / bound[..., None]], axis=-1)
+def measure_map(names):
+    """The table of each policy."""
+    for name in names:
+        found = find_controller(name)
+        print(f"{name}\nspeed  settled %  settling s  error mm  overshoot p90 % (x, y, z, yaw)  bound kept %  peak m/s")
+        rows = [at_setting(found.controller, found.task, value) for value in found.task.dial["speed"].grid(SETTINGS)]
+        for row in rows:
+            axes = ", ".join(f"{value:.0f}" for value in row["of axes"])
+            print(
+                f"{row['speed']:5.3f}  {row['settled']:9.0f}  {row['settling']:10.2f}  {row['error']:8.2f}"
+                f"  {row['overshoot']:6.1f} ({axes:>12})  {row['kept']:23.0f}  {row['peak']:8.2f}"
+            )
+        times = [row["settling"] for row in rows]
+        settled, kept = (min(row[name] for row in rows) for name in ("settled", "kept"))
+        error = max(row["error"] for row in rows)
+        print(
+            f"at least {settled:.0f} % settled on all axes, error at most {error:.2f} mm, bound kept in at least "
+            f"{kept:.0f} %, settling time strictly falling: {all(a > b for a, b in itertools.pairwise(times))}\n"
+        )
 
 
-@pytree
-class DialPolicy:
-    """A policy with its dial at a bound in m/s."""
-
-    actor: Any
-    bound: Any
-
-    def initial_memory(self):
-        """None."""
-        return ()
-
-    def act(self, memory, observation):
-        """The action for one observation."""
-        return memory, jnp.tanh(self.actor(see(observation, self.bound)))
-
-
-base = load_task("inspection-refined")
-family = SpeedFamily(task=dataclasses.replace(base, horizon=1500, initial_state=base.apg.initial_state))
-rate = optax.cosine_decay_schedule(5e-3, UPDATES, 0.02)
-optimiser = optax.chain(optax.clip_by_global_norm(1.0), optax.adam(rate, b1=0.7, b2=0.95))
-
-
-def worth(_, moved, outcome):
-    """The reward of a step less the cost of the margins below 8 %."""
-    weight = 40.0 * jnp.maximum(1.0, 0.8 / moved.numbers) ** 2
-    weights = {name: weight if name == "speed" else 40.0 for name in outcome.margins}
-    return outcome.reward - sum(
-        weights[name] * jnp.maximum(0.08 - margin, 0.0) ** 2 for name, margin in outcome.margins.items()
-    )
+def turned_flights(policy, task, random):
+    """One schedule, flown: its turns, and per flight the time until the new bound is kept, after each turn."""
+    number = random.integers(*TURNS)
+    times = np.sort(random.uniform(0.3, DURATION - 3.0, number))
+    dial = task.dial["speed"]
+    values = [float(dial.at(share)) for share in random.uniform(0, 1, number + 1)]
+    schedule = [[0.0, values[0]], *([round(float(t), 2), v] for t, v in zip(times, values[1:], strict=True))]
+    schedule = [pair for index, pair in enumerate(schedule) if not index or pair[0] > schedule[index - 1][0]]
+    flights = fly(
+        with_schedule(policy, {"speed": schedule}), task, trials=FLIGHTS, seed=int(random.integers(2**31)),
+        duration=DURATION,
+    )  # fmt: skip
+    speed = np.linalg.norm(flights.velocity, axis=-1)
+    jumps = np.abs(np.diff(flights.action, axis=1)).max(axis=-1)
+    ends = [*(start for start, _ in schedule[1:]), DURATION]
+    delays, at_turn = [], []
+    for (start, bound), end in zip(schedule[1:], ends[1:], strict=True):
+        first, last = round(start * 100), round(end * 100)
+        over = speed[:, first : last + 1] > bound
+        delays += [0.01 * (np.flatnonzero(row)[-1] + 1) if row.any() else 0.0 for row in over]
+        at_turn += list(jumps[:, first])
+    return flights, schedule, delays, at_turn, jumps
 
 
-def loss(actor, episodes, key):
-    """The mean cost of a step, and the episodes after the window."""
-    noise_key, reset_key = jax.random.split(key)
-    draws = Draw(
-        noise=jax.random.normal(noise_key, (WINDOW, NOISY, ENVIRONMENTS)),
-        keys=jax.random.split(reset_key, (WINDOW, ENVIRONMENTS)),
-    )
-
-    def decide(memory, observation, drawn, episodes):
-        return memory, jnp.tanh(actor(see(observation, episodes.numbers))), ()
-
-    (episodes, _), step = rollout(family, decide, (episodes, ()), draws, record=worth, slack=SLACK)
-    return -jnp.mean(step.record), episodes
-
-
-@jax.jit
-def update(actor, moments, episodes, key):
-    """One update, before which a third of the episodes gets another bound."""
-    key, new_key, chosen_key = jax.random.split(key, 3)
-    chosen = jax.random.uniform(chosen_key, (ENVIRONMENTS,)) < 1 / 3
-    bounds = jnp.where(chosen, draw_bound(new_key, (ENVIRONMENTS,)), episodes.numbers)
-    episodes = dataclasses.replace(episodes, numbers=bounds)
-    (_, episodes), gradient = jax.value_and_grad(loss, has_aux=True)(actor, episodes, key)
-    return *descend(optimiser, gradient, moments, actor), episodes
-
-
-actor_key, episode_key, key = jax.random.split(jax.random.key(SEED), 3)
-actor = ema = make_network(actor_key, (SIZE + 4, 64, 64, 4), last_gain=0.01)
-moments = optimiser.init(actor)
-episodes = reset_all(family, jax.random.split(episode_key, ENVIRONMENTS))
-began = time.monotonic()
-for number in range(UPDATES):
-    actor, moments, episodes = update(actor, moments, episodes, jax.random.fold_in(key, number))
-    ema = averaged(ema, actor, 0.95, jnp.asarray(number))
-jax.block_until_ready(ema)
-print(f"{UPDATES} updates, seed {SEED}: {time.monotonic() - began:.0f} s")
-print("bound [m/s]  settled  settling [s]  error [mm]  peak speed, p95 [m/s]  over the bound  crashed")
-for bound in BOUNDS:
-    task = load_task("baseline", {"termination.speed.bound": bound})
-    flights = fly(DialPolicy(actor=ema, bound=jnp.float32(bound)), task, duration=max(10.0, 6 / bound))
-    judged = judge(flights).to_dict()
-    position, speed = judged["position"], judged["peak_speed"]["p95"]
-    settling, error = position["settling_time"]["median"], position["steady_state_error"]["median"]
-    settling = "-" if settling is None else f"{settling:.2f}"
+def turns(name="dial"):
+    """1,000 flights with turns at random times."""
+    found, random = find_controller(name), np.random.default_rng(0)
+    crashed = late = 0
+    delays, at_turn, elsewhere, up, settled = [], [], [], 0, 0
+    for _ in range(SCHEDULES):
+        flights, schedule, delay, jump, jumps = turned_flights(found.controller, found.task, random)
+        crashed += int(judge(flights).crashed.sum())
+        settled += judge(flights).settled("position")
+        late += int(np.any(flights.margins["speed"] < 0, axis=1).sum())
+        up += sum(after > before for (_, before), (_, after) in itertools.pairwise(schedule))
+        delays, at_turn = delays + delay, at_turn + jump
+        elsewhere.append(jumps[:, 100:].ravel())
+    spread = np.quantile(delays, [0.5, 0.95, 0.99, 1.0])
     print(
-        f"{bound:11g}  {position['settled']:7}  {settling:>12}  {1e3 * error:10.1f}  {speed:21.3f}"
-        f"  {judged['violations']['speed']:14}  {judged['crashed']:7}"
-    )
+        f"{SCHEDULES * FLIGHTS} flights, {len(delays)} turns ({up * FLIGHTS} of them up): {crashed} crashed, "
+        f"{settled} settled at the end of {DURATION:g} s\n"
+        "time after a turn until the new speed bound is kept: median {:.2f}, p95 {:.2f}, p99 {:.2f}, largest {:.2f} s\n"
+        "flights that cross the bound of the setting at which the dial stands: {}\n"
+        "largest change of an action in the step of a turn: median {:.3f}, p99 {:.3f}, largest {:.3f}; in all steps "
+        "after the first second: p99 {:.3f}, largest {:.3f}".format(
+            *spread, late, *np.quantile(at_turn, [0.5, 0.99, 1.0]),
+            *np.quantile(np.concatenate(elsewhere), [0.99, 1.0]),
+        )
+    )  # fmt: skip
+
+
+def wishes():
+    """30 settling times, drawn evenly, each as a command of its own."""
+    random, answered = np.random.default_rng(0), 0
+    for wish in random.uniform(FASTEST, SLOWEST, WISHES).round(2):
+        with tempfile.TemporaryDirectory() as folder:
+            began = time.monotonic()
+            command = [
+                sys.executable,
+                "-m",
+                "flytune",
+                "tune",
+                "--settling-time",
+                str(wish),
+                "--out",
+                f"{folder}/tuned",
+            ]
+            done = subprocess.run(command, capture_output=True, text=True, check=False)
+            took = time.monotonic() - began
+        lines = done.stdout.splitlines()
+        untrained = done.returncode == 0 and any("after 0 trainings" in line for line in lines)
+        answered += untrained
+        verdict = next((line for line in reversed(lines) if line.startswith("validation")), done.stderr.strip())
+        print(f"{wish:5.2f} s  {took:5.1f} s of work  {'no training' if untrained else 'trained':11}  {verdict[14:]}")
+    print(f"{answered} of {WISHES} answered without training")
+
+
+def price():
+    """The policy with a dial beside the single policies, on the same trials."""
+    found = find_controller("dial")
+    print("setting      policy               settled  settling s  error mm  jitter   bytes")
+    for name, speed in SINGLE.items():
+        task = load_task(name)
+        for label, policy in ((name, find_controller(name).controller), ("dial", found.controller.at(speed=speed))):
+            own = task if label == name else found.task
+            judged = judge(fly(policy, own, trials=200, seed=5, duration=20.0 if speed < 0.5 else 10.0))
+            print(
+                f"{speed:.1f} m/s      {label:20} {judged.settled('position'):4}/200"
+                f"  {quantile(judged.settling_time['position'], 0.5):10.2f}"
+                f"  {1e3 * quantile(judged.steady_state_error['position'], 0.5):8.2f}"
+                f"  {np.mean(judged.action_total_variation):.4f}"
+                f"  {sum(np.asarray(leaf).nbytes for leaf in (*policy.actor.weights, *policy.actor.biases)):6}"
+            )
+
+
+if __name__ == "__main__":
+    if len(sys.argv) < 2 or sys.argv[1] not in ("map", "turns", "wishes", "price"):
+        sys.exit(__doc__)
+    command, arguments = sys.argv[1], sys.argv[2:]
+    if command == "map":
+        measure_map(arguments or ["dial"])
+    else:
+        {"turns": turns, "wishes": wishes, "price": price}[command](*arguments)

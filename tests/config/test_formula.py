@@ -19,6 +19,8 @@ from flytune.config.formula import Formula
         ("2 * speed / 4", 0.2),
         ("(speed / 0.8) ** -2", 4.0),
         ("2 ** 3 ** 2", 512.0),  # as in mathematics, from the right
+        ("(speed - 1) ** 2", 0.36),
+        ("(speed - speed) ** 2 + (speed - 1) ** 3", -0.216),
         ("max(speed, 0.7) + min(speed, 0.1)", 0.8),
         ("exp(log(speed))", 0.4),
         ("sqrt(damping)", 3.0),
@@ -62,7 +64,7 @@ def test_a_formula_can_be_written_in_another_language():
     text = Formula("-2 * max(speed, 1) ** 0.5").build(
         number=str, operation=lambda name, *values: f"{name}({', '.join(values)})", constant=str
     )
-    assert text == "*(-(0.0, 2.0), exp(*(0.5, log(max(speed, 1.0)))))"
+    assert text == "*(-(0.0, 2.0), **(max(speed, 1.0), 0.5))"
 
 
 def test_the_gradient_of_a_formula_is_that_of_mathematics():

@@ -9,24 +9,42 @@ from flytune.task.task import load_task
 from flytune.tuning.requirement import make_requirement
 from flytune.tuning.start import find_start
 
+BOUND = {"termination.altitude.bound": 0.09}  # a field that all known tasks have
 
-@pytest.mark.parametrize(
-    ("time", "name"), [(2.0, "acrobatic-refined"), (3.0, "baseline-refined"), (9.0, "inspection-refined")]
-)
-def test_it_is_the_known_task_that_settles_nearest(time, name):
+
+@pytest.mark.parametrize("time", [2.3, 4.0, 9.0])
+def test_a_requirement_that_the_dial_covers_starts_with_a_policy_that_meets_it(time):
     start = find_start(make_requirement(time), None, {}, "apg")
+    assert (start.name, list(start.times)) == ("dial", ["dial"])
+    assert start.times["dial"] == pytest.approx(time, rel=0.05)  # the training set allows half of the tolerance
+    assert start.policy is not None
+    assert start.policy.actor.sizes == (17, 64, 64, 4)  # without its dial
+    assert not start.task.dial
+    assert start.task.speed_bound == pytest.approx(start.setting["speed"])
+    assert start.judgement is not None
+    assert (start.judgement.trials, start.judgement.duration >= 2.5 * time) == (100, True)
+
+
+@pytest.mark.parametrize(("time", "name"), [(1.5, "dial"), (14.0, "dial"), (3.0, "baseline-refined")])
+def test_elsewhere_it_is_the_known_task_that_settles_nearest(time, name):
+    # a bound on speed cannot be set in the task with a dial, which the bound follows
+    edits = {} if name == "dial" else {"termination.speed.bound": 0.8}
+    start = find_start(make_requirement(time), None, edits, "apg")
     assert start.name == name
     nearness = {other: abs(math.log(seconds / time)) for other, seconds in start.times.items()}
     assert min(nearness, key=nearness.__getitem__) == name
-    assert len(nearness) == 3
-    assert start.judgement is not None
-    assert start.judgement.trials == 100
-    assert start.judgement.duration >= 2.5 * time
+    assert len(nearness) == (4 if name == "dial" else 3)
+
+
+def test_a_field_of_the_user_that_does_not_follow_the_dial_is_kept():
+    start = find_start(make_requirement(4), None, BOUND, "apg")
+    assert start.name == "dial"
+    assert start.task.termination["altitude"].bound == 0.09
 
 
 def test_a_known_task_without_the_users_field_is_left_out():
     start = find_start(make_requirement(9), None, {"termination.tilt.bound_deg": 20.0}, "apg")
-    assert list(start.times) == ["inspection-refined"]
+    assert "baseline-refined" not in start.times
     assert start.task.termination["tilt"].bound_deg == 20.0
 
 
@@ -37,19 +55,19 @@ def test_a_field_that_no_known_task_has_is_refused():
 
 def test_a_task_without_a_known_policy_is_trained_from_new_weights():
     start = find_start(make_requirement(3), "baseline", {}, "apg")
-    assert (start.name, start.files) == ("baseline", None)
+    assert (start.name, start.policy) == ("baseline", None)
     # the first training uses the settings of the task, a warm start those of the tuning
     assert (start.first.apg.learning_rate, start.task.apg.learning_rate) == (0.005, 0.002)
 
 
 def test_a_known_policy_with_other_layers_than_the_user_wants_is_not_used():
-    assert find_start(make_requirement(3), "baseline-refined", {"apg.hidden": [32, 32]}, "apg").files is None
+    assert find_start(make_requirement(3), "baseline-refined", {"apg.hidden": [32, 32]}, "apg").policy is None
 
 
 def test_ppo_starts_from_a_policy_that_ppo_has_trained():
     start = find_start(make_requirement(4), None, {}, "ppo")
-    assert start.files is not None
-    assert start.files[0].stem.endswith("@ppo")
+    assert start.record is not None
+    assert start.record.stem.endswith("@ppo")
     # the settings of the other trainer stay as they are
     assert start.task.apg == load_task(start.name).apg
 

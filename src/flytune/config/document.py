@@ -4,6 +4,7 @@
 """
 
 import dataclasses
+import functools
 import tomllib
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -72,13 +73,19 @@ def read(kind: type[T], data: Mapping[str, Any], where: str = "") -> T:
     """
     prefix = f"{where}: " if where else ""
     try:
-        result = TypeAdapter(kind).validate_python(data)
+        result = _adapter(kind).validate_python(data)
     except ValidationError as error:
         raise BadInput(prefix + _explain(kind, data, error)) from None
     for path, node in _nodes(result):
         if problem := getattr(node, "problem", lambda: None)():
             raise BadInput(prefix + ".".join((*path, problem)))
     return result
+
+
+@functools.cache
+def _adapter(kind: Any) -> Any:
+    """What checks the values of a dataclass; to build it takes longer than to use it."""
+    return TypeAdapter(kind)
 
 
 def parse_assignment(text: str) -> tuple[str, Any]:

@@ -40,7 +40,7 @@ class Formula(str):
     def value(self, numbers: Mapping[str, Any]) -> Any:
         """The value where each name has a number, of Python or of JAX.
 
-        A power is computed as exp(b log a), so its base has to be positive.
+        A power whose exponent is no whole number is computed as exp(b log a), so its base has to be positive.
 
         Raises:
             ValueError: it is not a formula, or a name has no number.
@@ -60,19 +60,13 @@ class Formula(str):
 
         Args:
             number: the value of a name.
-            operation: of a name in `OPERATORS` or `FUNCTIONS` and values. A power comes as exp, * and log.
+            operation: of a name in `OPERATORS` or `FUNCTIONS` and values.
             constant: the value of a number.
 
         Raises:
             ValueError: it is not a formula.
         """
-
-        def apply(name: str, *values: T) -> T:
-            if name == "**":
-                return operation("exp", operation("*", values[1], operation("log", values[0])))
-            return operation(name, *values)
-
-        return _walk(_parse(self), number, apply, constant)
+        return _walk(_parse(self), number, operation, constant)
 
 
 def _parse(text: str) -> ast.expr:
@@ -135,6 +129,8 @@ def _compute(operation: str, values: tuple[Any, ...], library: Any) -> Any:
             return values[0] * values[1]
         case "/":
             return values[0] / values[1]
+        case "**" if isinstance(values[1], float) and values[1].is_integer() and abs(values[1]) <= 16:
+            return values[0] ** int(values[1])
         case "**":
             return library.exp(values[1] * library.log(values[0]))
         case "min" | "max":

@@ -19,7 +19,7 @@ from flytune.config.files import write_bytes
 from flytune.config.pytree import label, pytree, static
 from flytune.errors import BadInput
 from flytune.task import observation
-from flytune.task.dial import Dial, Input, Setting, checked_setting, number_of_inputs, told
+from flytune.task.dial import Dial, Input, Setting, checked_setting, number_of_inputs, read_named, told
 from flytune.task.observation import SIZE
 
 FORMAT = "flytune-policy-1"
@@ -218,8 +218,8 @@ def _assemble(path: Path, header: dict[str, Any], tensors: dict[str, np.ndarray]
 
 def _dials(path: Path, header: dict[str, Any]) -> tuple[dict[str, Dial], dict[str, Input], dict[str, float]]:
     """The dials of a policy's header, its further inputs and its setting."""
-    dials = document.read(dict[str, Dial], header.get("dials", {}), f"{path}: dials")
-    inputs = document.read(dict[str, Input], header.get("inputs", {}), f"{path}: inputs")
+    dials = read_named(Dial, header.get("dials", {}), f"{path}: dials")
+    inputs = read_named(Input, header.get("inputs", {}), f"{path}: inputs")
     given = header.get("setting", {})
     setting = checked_setting(dials, given if isinstance(given, dict) else {}, f"{path}: setting")
     for name, each in inputs.items():

@@ -2,8 +2,9 @@
 
 import itertools
 from collections.abc import Mapping
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
@@ -16,6 +17,7 @@ from flytune.task.dial import Dial, Setting, checked_setting
 Schedule = Mapping[str, Any]  # dial -> its value; or [[time in s, value], ...], the first at 0
 
 
+@runtime_checkable
 class Dialled(Protocol):
     """A controller with dials: a `Policy`, or one that runs the file of another program."""
 
@@ -40,35 +42,48 @@ class Dialled(Protocol):
 
 @pytree
 class ScheduledPolicy:
-    """A policy that sets its dials by a schedule; its memory is the number of steps since the start."""
+    """A policy that turns its dials by a schedule, no faster than `Dial.sweep_time` allows.
+
+    Its memory is the number of steps since the start, and the share of its range at which each dial stands.
+    """
 
     policy: Dialled
     first_steps: dict[str, Int[Array, "_"]]  # dial -> the control step from which each of its values holds
-    values: dict[str, Float[Array, "_"]]
+    shares: dict[str, Float[Array, "_"]]  # of the range, for each value
 
     @property
     def dials(self) -> dict[str, Dial]:
         """The dials of the policy."""
         return self.policy.dials
 
-    def settings(self) -> list[tuple[int, dict[str, float]]]:
-        """Each setting, and the control step from which it holds, in the order of time."""
-        changes = sorted({0, *(int(step) for steps in self.first_steps.values() for step in steps)})
-        return [(step, {name: float(value) for name, value in self._at(step).items()}) for step in changes]
-
-    def initial_memory(self) -> Int[Array, ""]:
-        """No step yet."""
-        return jnp.zeros((), jnp.int32)
+    def initial_memory(self) -> Any:
+        """No step yet; all dials at the first value of their schedule."""
+        return jnp.zeros((), jnp.int32), {name: shares[0] for name, shares in self.shares.items()}
 
     def act(self, memory: Any, observation: Float[Array, "17"]) -> tuple[Any, Float[Array, "4"]]:
-        """The number of steps, and the action of one observation at the setting of this step."""
-        return memory + 1, self.policy(observation, self._at(memory))
+        """The memory, and the action of one observation at the setting of this step."""
+        step, now = memory
+        moved = {name: self._moved(name, step, share) for name, share in now.items()}
+        setting = {**self.policy.setting, **{name: self.dials[name].at(share) for name, share in moved.items()}}
+        return (step + 1, moved), self.policy(observation, setting)
 
-    def _at(self, step: Any) -> dict[str, Any]:
-        setting = dict(self.policy.setting)
-        for name, first_steps in self.first_steps.items():
-            setting[name] = self.values[name][jnp.sum(first_steps <= step) - 1]
-        return setting
+    def settings(self, steps: int) -> dict[str, Float[np.ndarray, "steps"]]:
+        """The value of every dial at each of the first control steps."""
+
+        def one(now: Any, step: Any) -> Any:
+            moved = {name: self._moved(name, step, share) for name, share in now.items()}
+            return moved, {name: self.dials[name].at(share) for name, share in moved.items()}
+
+        values = jax.lax.scan(one, self.initial_memory()[1], jnp.arange(steps))[1]
+        constant = {name: np.full(steps, float(value)) for name, value in self.policy.setting.items()}
+        return constant | {name: np.asarray(value, float) for name, value in values.items()}
+
+    def _moved(self, name: str, step: Any, share: Any) -> Any:
+        """The share of the range at which a dial stands in this step, from that of the step before."""
+        wanted = self.shares[name][jnp.sum(self.first_steps[name] <= step) - 1]
+        sweep_time = self.dials[name].sweep_time
+        fastest = jnp.where(sweep_time > 0, CONTROL_PERIOD / jnp.maximum(sweep_time, CONTROL_PERIOD), 1.0)
+        return share + jnp.clip(wanted - share, -fastest, fastest)
 
 
 def with_schedule(policy: Dialled, schedule: Schedule) -> Any:
@@ -76,15 +91,15 @@ def with_schedule(policy: Dialled, schedule: Schedule) -> Any:
 
     Args:
         policy: with dials.
-        schedule: dial -> its value; or pairs [time in s, value], the first at 0 s, in the order of time. A value holds
-            until the next one.
+        schedule: dial -> its value; or pairs [time in s, value], the first at 0 s, in the order of time. From each time
+            on the dial moves to the value, and stays there until the next time.
 
     Raises:
         BadInput: an unknown dial, a value out of range, or times that are not in order.
     """
     fixed = {name: value for name, value in schedule.items() if not isinstance(value, list | tuple)}
     policy = policy.at(fixed)
-    first_steps, values = {}, {}
+    first_steps, shares = {}, {}
     for name in schedule.keys() - fixed.keys():
         pairs = [_pair(name, each) for each in schedule[name]]
         steps = [round(time / CONTROL_PERIOD) for time, _ in pairs]
@@ -94,8 +109,9 @@ def with_schedule(policy: Dialled, schedule: Schedule) -> Any:
                 "rising times."
             )
         first_steps[name] = jnp.asarray(steps, jnp.int32)
-        values[name] = jnp.asarray([checked_setting(policy.dials, {name: value})[name] for _, value in pairs])
-    return ScheduledPolicy(policy=policy, first_steps=first_steps, values=values) if values else policy
+        values = [checked_setting(policy.dials, {name: value})[name] for _, value in pairs]
+        shares[name] = jnp.asarray([policy.dials[name].share(value) for value in values])
+    return ScheduledPolicy(policy=policy, first_steps=first_steps, shares=shares) if shares else policy
 
 
 def _pair(name: str, given: Any) -> tuple[float, float]:

@@ -28,7 +28,6 @@ from flytune.task.task import Task
 ACTION = slice(SIZE - 4, SIZE)  # of an observation: the last action, which carries no noise
 InitialConditions = Literal["clear", "paper"]
 CHUNK = 100  # steps that are flown by one compiled program
-TRANSITION = 1.5  # s after a dial is turned, by when the bounds of the new setting hold (docs/dial.md)
 
 
 def fly(
@@ -66,8 +65,7 @@ def fly(
     """
     if isinstance(controller, FoundController):
         controller, name = controller.controller, name or controller.name
-    settings = settings_for(controller, task)
-    along, task = [(step, task.at(setting)) for step, setting in settings], task.at(settings[0][1])
+    family, task = task, task.at(_setting(controller, task))
     duration = task.duration if duration is None else duration
     if not 1 <= trials <= 100_000:
         raise BadInput(f"trials: {trials} is not allowed. Allowed: a whole number, 1 to 100000.")
@@ -96,16 +94,18 @@ def fly(
     finally:
         made.close()
     states, actions = np.asarray(record.states), np.asarray(record.actions)
+    turned = _turned(controller, family, steps)
+    margins = _margins_along(family, turned, states, actions) if turned else _margins(task, states, actions)
     trajectories = VehicleStates.from_rows(np.ascontiguousarray(states.transpose(2, 0, 1)))
     return Flights(
         time=np.arange(steps + 1) * CONTROL_PERIOD,
         **{field: getattr(trajectories, field) for field in WIDTHS},
         action=np.ascontiguousarray(actions.transpose(2, 0, 1)),
         crashed=np.asarray(record.crashed),
-        margins=_margins_along(along, states, actions),
+        margins={name: np.asarray(margin) for name, margin in margins.items()},
         target_position=np.asarray(task.target.position),
         target_yaw=float(task.target.yaw),
-        speed_bound=_largest([each.speed_bound for _, each in along]),
+        speed_bound=_largest_speed_bound(family, turned) if turned else task.speed_bound,
         name=name,
         task=task.name,
         vehicle=task.vehicle.name,
@@ -115,36 +115,30 @@ def fly(
     )
 
 
-def settings_for(controller: Any, task: Task) -> list[tuple[int, dict[str, float]]]:
-    """The settings of a task's dials in a flight, each with the control step from which it holds.
+def _setting(controller: Any, task: Task) -> dict[str, float]:
+    """The setting of a task's dials that a controller flies: its own of the dials that it has, the default of others.
 
-    A dial that the controller has is set as in the controller; any other is at its default.
+    Of a controller whose dials are turned in flight, it is that of the start.
     """
-    default = {name: float(dial.default) for name, dial in task.dial.items()}
-    settings = controller.settings() if hasattr(controller, "settings") else [(0, getattr(controller, "setting", {}))]
-    return [(step, {name: float(own.get(name, value)) for name, value in default.items()}) for step, own in settings]
+    own = getattr(controller, "setting", {})
+    if hasattr(controller, "settings"):
+        own = {name: values[0] for name, values in controller.settings(1).items()}
+    return {name: float(own.get(name, dial.default)) for name, dial in task.dial.items()}
 
 
-def _largest(bounds: list[float | None]) -> float | None:
-    """The largest of all speed bounds, None where one is None."""
-    return max((each for each in bounds if each is not None), default=None) if None not in bounds else None
+def _turned(controller: Any, task: Task, steps: int) -> dict[str, np.ndarray]:
+    """The setting of the task's dials at samples 0 to T where the controller turns them in flight; else empty."""
+    if not task.dial or not hasattr(controller, "settings"):
+        return {}
+    own = controller.settings(steps + 1)
+    return {name: own.get(name, np.full(steps + 1, float(dial.default))) for name, dial in task.dial.items()}
 
 
-def _margins_along(tasks: list[tuple[int, Task]], states: np.ndarray, actions: np.ndarray) -> dict[str, np.ndarray]:
-    """The margins [N, T + 1] of flights in which the task changes at given steps, by the bounds that hold at each step.
-
-    After a change the vehicle has `TRANSITION` seconds, in which the wider of the bounds before and after it holds.
-    """
-    (_, first), *changes = tasks
-    found = {name: np.array(margin) for name, margin in _margins(first, states, actions).items()}
-    for step, task in changes:
-        after = {name: np.asarray(margin) for name, margin in _margins(task, states, actions).items()}
-        end = step + round(TRANSITION / CONTROL_PERIOD)
-        found = {name: margin.copy() for name, margin in found.items()}
-        for name, margin in found.items():
-            margin[:, step:end] = np.maximum(margin[:, step:end], after[name][:, step:end])
-            margin[:, end:] = after[name][:, end:]
-    return found
+def _largest_speed_bound(task: Task, settings: dict[str, np.ndarray]) -> float | None:
+    """The largest speed bound of a flight in which the dials are turned, None where a setting has none."""
+    ends = [{name: float(pick(values)) for name, values in settings.items()} for pick in (np.min, np.max)]
+    bounds = [task.at(each).speed_bound for each in ends]
+    return None if None in bounds else max(bound for bound in bounds if bound is not None)
 
 
 def _check_controller(controller: Any) -> None:
@@ -345,6 +339,19 @@ def _margins(task: Task, states: jax.Array, actions: jax.Array) -> dict[str, jax
     def one(numbers: jax.Array, actions: jax.Array) -> dict[str, jax.Array]:
         none_pending = jnp.zeros((len(actions), task.vehicle.action_latency_steps, 4))
         return margins_along(task, state_from(numbers.T, none_pending), actions)
+
+    return jax.vmap(one, in_axes=-1)(states, actions)
+
+
+@program()
+def _margins_along(
+    task: Task, settings: dict[str, jax.Array], states: jax.Array, actions: jax.Array
+) -> dict[str, jax.Array]:
+    """The margins [N, T + 1] where the dials of the task have the settings [T + 1]."""
+
+    def one(numbers: jax.Array, actions: jax.Array) -> dict[str, jax.Array]:
+        none_pending = jnp.zeros((len(actions), task.vehicle.action_latency_steps, 4))
+        return margins_along(task, state_from(numbers.T, none_pending), actions, settings)
 
     return jax.vmap(one, in_axes=-1)(states, actions)
 

@@ -162,7 +162,7 @@ def _model(policy: Policy) -> Any:
 def _further_inputs(policy: Policy, node: Callable[..., str], weight: Callable[..., str]) -> list[str]:
     """The inputs of the network behind the observation, each [batch, its size], as nodes of the graph."""
     count = itertools.count()
-    operators = {"+": "Add", "-": "Sub", "*": "Mul", "/": "Div"}
+    operators = {"+": "Add", "-": "Sub", "*": "Mul", "/": "Div", "**": "Pow"}
 
     def operation(name: str, *values: str) -> str:
         return node(operators.get(name, name.capitalize()), *values, output=f"formula.{next(count)}")

@@ -149,7 +149,21 @@ def is_crashed(task: Task, state: State) -> Bool[Array, ""]:
     return ~((distance <= CRASH_DISTANCE) & jnp.all(jnp.isfinite(body)))
 
 
-def margins_along(task: Task, states: State, actions: Float[Array, "T 4"]) -> dict[str, Float[Array, "T"]]:
-    """The margin of each termination at every sample of one trial, first axis time; `states` [T, ...] likewise."""
+def margins_along(
+    task: Task, states: State, actions: Float[Array, "T 4"], settings: Any = None
+) -> dict[str, Float[Array, "T"]]:
+    """The margins of each termination along one trial, first axis time; `states` [T, ...] likewise.
+
+    Args:
+        task: the task, or where its dials are turned in flight the family.
+        states: the states [T, ...].
+        actions: the action before each state.
+        settings: of the dials, each [T]; None for a task without dials.
+    """
     changes = jnp.diff(actions, axis=0, prepend=jnp.zeros_like(actions[:1]))
-    return jax.vmap(lambda s, change: margins(task.termination, situation(task.target, s, change)))(states, changes)
+
+    def one(state: State, change: Array, numbers: Any) -> dict[str, Array]:
+        here = task if numbers is None else task.member(numbers)
+        return margins(here.termination, situation(here.target, state, change))
+
+    return jax.vmap(one)(states, changes, settings)

@@ -3,19 +3,21 @@
 import dataclasses
 import math
 from collections.abc import Mapping
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, TypeVar
 
 import jax
 import jax.numpy as jnp
 from annotated_types import Ge, Le, Unit
 from jaxtyping import Array, Float
 
+from flytune.config import document
 from flytune.config.document import Real
 from flytune.config.formula import Formula
 from flytune.config.pytree import label, pytree, static
 from flytune.errors import BadInput
 from flytune.task.observation import BLOCK_NAMES, BLOCKS
 
+T = TypeVar("T")
 Setting = Mapping[str, Any]  # dial -> its value
 TOLERANCE = 1e-6  # share of a range, by which rounding may exceed it
 
@@ -29,6 +31,7 @@ class Dial:
     default: Annotated[Real, Unit("see unit")]
     spacing: Literal["linear", "logarithmic"] = static(default="linear")  # drawn evenly in the value or its logarithm
     turned: Annotated[Real, Ge(0), Le(1), Unit("1")] = 0.0  # share of the episodes in which each update turns it
+    sweep_time: Annotated[Real, Ge(0), Unit("s")] = 0.0  # in flight, a turn over the whole range takes this long
     unit: str = label(default="")
     meaning: str = label(default="")
 
@@ -48,6 +51,13 @@ class Dial:
         if self.spacing == "linear":
             return self.lowest + (self.highest - self.lowest) * share
         return self.lowest * xp.exp(xp.log(self.highest / self.lowest) * share)
+
+    def share(self, value: Any) -> Any:
+        """The share of the range at which a value lies, the inverse of `at`; of any arrays."""
+        xp: Any = jnp if isinstance(value, jax.Array) else math
+        if self.spacing == "linear":
+            return (value - self.lowest) / (self.highest - self.lowest)
+        return xp.log(value / self.lowest) / xp.log(self.highest / self.lowest)
 
     def draw(self, key: jax.Array) -> jax.Array:
         """A random value, even in the spacing."""
@@ -98,6 +108,17 @@ def told(
 def number_of_inputs(inputs: Mapping[str, Input]) -> int:
     """How many numbers `told` puts behind the observation."""
     return sum(each.size for each in inputs.values())
+
+
+def read_named(kind: type[T], data: Any, where: str) -> dict[str, T]:
+    """The dials or inputs of the header of a file, by their names.
+
+    Raises:
+        BadInput: they are damaged; the message begins with `where`.
+    """
+    if not isinstance(data, dict) or not all(isinstance(each, dict) for each in data.values()):
+        raise BadInput(f"{where}: is damaged. Allowed: one table for each name.")
+    return {name: document.read(kind, each, f"{where}.{name}") for name, each in data.items()}
 
 
 def checked_setting(dials: Mapping[str, Dial], setting: Setting, where: str = "dial") -> dict[str, float]:

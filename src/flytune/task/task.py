@@ -113,7 +113,7 @@ class Task:
 
     def see(self, observation: Float[Array, "*batch 17"], numbers: Any) -> Float[Array, "*batch _"]:
         """What a controller is given of an observation at a setting: the observation and the inputs of the dials."""
-        return told(self.input, observation, numbers)
+        return told(self.input, observation, numbers) if self.input else observation
 
     def at(self, setting: Setting | None = None) -> "Task":
         """The fixed task at a setting of the dials, a dial that is not named at its default.

@@ -1,10 +1,28 @@
 """The flights of a tuning."""
 
+from typing import Any
+
+import jax.numpy as jnp
+
+from flytune.config.pytree import pytree
 from flytune.control.policy import Policy
 from flytune.evaluation.fly import fly
 from flytune.evaluation.judge import Judgement, judge
 from flytune.task.task import Task
 from flytune.tuning.requirement import Requirement
+
+
+@pytree
+class HoverThrust:
+    """A controller that asks for hover speed at all times; it serves to draw initial conditions."""
+
+    def initial_memory(self) -> tuple[()]:
+        """None."""
+        return ()
+
+    def act(self, memory: Any, observation: Any) -> Any:
+        """The action 0."""
+        return memory, jnp.zeros(4)
 
 
 def fly_for(requirement: Requirement, policy: Policy, task: Task, seed: int, trials: int) -> Judgement:

@@ -11,6 +11,7 @@ from flytune.config.files import write_json, write_text
 from flytune.config.nested import first_difference
 from flytune.control.policy import Policy, load_policy, save_policy
 from flytune.errors import Diverged
+from flytune.evaluation.evaluate import Evaluation, evaluate
 from flytune.evaluation.judge import Judgement
 from flytune.runs.directory import has_checkpoint
 from flytune.task.task import Task, load_task, write_task
@@ -53,6 +54,7 @@ class Tuner:
 
     def __post_init__(self) -> None:
         self.target = self.requirement.tightened()  # on the training set
+        self.validated: dict[int, Evaluation] = {}  # iteration -> its last validation, of this process
         self.duration = self.requirement.trial_duration()
         self.sensitivities = load_sensitivities()
         self.start = find_start(self.requirement, self.task, self.edits, self.trainer)
@@ -159,7 +161,9 @@ class Tuner:
         """The result of an iteration on a validation set of its own."""
         seed = VALIDATION_SEED + len(self.history.validations)
         policy, task = self._policy(iteration.number), self.task_of(iteration)
-        judgement = fly_for(self.requirement, policy, task, seed, VALIDATION_TRIALS)
+        duration = self.requirement.trial_duration()
+        flown = evaluate(policy, task, name=str(self.out), trials=VALIDATION_TRIALS, seed=seed, duration=duration)
+        self.validated[iteration.number], judgement = flown, flown.judgement
         response = self._response(judgement)
         validation = Validation(
             iteration=iteration.number, seed=seed, judgement=judgement.to_dict(),

@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 from flytune.config import document
-from flytune.control.classical import classical_controller
 from flytune.control.policy import Policy, load_policy
 from flytune.errors import BadInput
 from flytune.evaluation.fly import fly
@@ -17,7 +16,7 @@ from flytune.task.task import Task, load_task
 from flytune.training.trainer import find_trainer
 from flytune.tuning.dial_start import DIAL, find_setting
 from flytune.tuning.feasibility import check_feasible
-from flytune.tuning.flying import fly_for
+from flytune.tuning.flying import HoverThrust, fly_for
 from flytune.tuning.history import TRAINING_SEED, TRAINING_TRIALS
 from flytune.tuning.requirement import Requirement, ResponseSummary
 from flytune.tuning.rules import edited, is_fixed
@@ -55,8 +54,7 @@ def find_start(requirement: Requirement, wanted: str | None, edits: Mapping[str,
     """
     tasks = {wanted: load_task(wanted, dict(edits))} if wanted else _known_tasks(edits)
     first = next(iter(tasks.values()))
-    anyone = classical_controller("lqr", load_task("baseline"), "tuned")  # only the initial conditions are used
-    flights = fly(anyone, first, trials=TRAINING_TRIALS, seed=TRAINING_SEED, duration=0.6)
+    flights = fly(HoverThrust(), first, trials=TRAINING_TRIALS, seed=TRAINING_SEED, duration=0.6)
     check_feasible(first, requirement, flights, tuple(edits))
     name = WITHOUT_POLICY if WITHOUT_POLICY in tasks else next(iter(tasks))
     policy = record = judgement = None

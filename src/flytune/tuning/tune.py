@@ -95,7 +95,7 @@ def tune(
             f"interrupted in iteration {len(tuner.history.iterations)}. All results so far are in {directory}. "
             f"To continue, repeat the command with --out {directory} and --resume."
         ) from None
-    write_tuning(directory / "report.html", result.to_dict())
+    write_tuning(directory / "report.html", result.to_dict(), tuner.validated.get(result.best))
     trainings = sum(each.seconds > 0 for each in result.iterations)
     outcome = f"requirement {'met' if result.met else 'not met'}; the best policy is that of iteration {result.best}"
     say(line("result", f"{outcome}, after {trainings} trainings and {time.monotonic() - began:.0f} s"))

@@ -101,7 +101,7 @@ class OnnxController:
         """The action for one observation, see `Controller`."""
         return memory, self(observation)
 
-    def _answer(self, observation: Any, dial: Any) -> np.ndarray:
+    def _answer(self, observation: Any, dial: Any = ()) -> np.ndarray:
         # NumPy only: a call of JAX from here would wait for the compiled program that waits for this function
         observations, dials = np.asarray(observation), np.asarray(dial)
         shape = (*observations.shape[:-1], 4)

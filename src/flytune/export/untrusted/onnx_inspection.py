@@ -11,10 +11,9 @@ from typing import Any
 
 import numpy as np
 
-from flytune.config import document
 from flytune.control.policy import CONVENTIONS
 from flytune.errors import BadInput, require
-from flytune.task.dial import Dial
+from flytune.task.dial import Dial, read_named
 from flytune.task.observation import SIZE
 
 INPUT, OUTPUT = "observation", "action"
@@ -52,6 +51,8 @@ def inspect(content: bytes, where: str) -> Any:
     model.DiscardUnknownFields()  # a field that was not inspected must not be run
     _refuse_other_files(onnx, model, where)
     _refuse_more_than_arithmetic(onnx, model, where)
+    if not all(isinstance(text, str) for entry in model.metadata_props for text in (entry.key, entry.value)):
+        raise BadInput(f"{where}: has damaged metadata (bytes that are not UTF-8). Export it again.")
     _refuse_other_inputs_and_outputs(onnx, model, where)
     try:
         onnx.checker.check_model(model, full_check=True)
@@ -74,9 +75,7 @@ def read_dials(model: Any, where: str) -> dict[str, Dial]:
         found = json.loads(metadata(model).get(DIALS, "{}"))
     except ValueError:
         found = None
-    if not isinstance(found, dict):
-        raise BadInput(f"{where}: the metadata entry {DIALS!r} is damaged. Export it again.")
-    dials = document.read(dict[str, Dial], found, f"{where}: {DIALS}")
+    dials = read_named(Dial, found, f"{where}: {DIALS}")
     return {name: dials[name] for name in sorted(dials)}
 
 
@@ -161,8 +160,6 @@ def _refuse_wide_nodes(inferred: Any, where: str) -> None:
 
 
 def _refuse_other_conventions(model: Any, where: str) -> None:
-    if not all(isinstance(text, str) for entry in model.metadata_props for text in (entry.key, entry.value)):
-        raise BadInput(f"{where}: has damaged metadata (bytes that are not UTF-8). Export it again.")
     found = metadata(model)
     # a graph does not say what its numbers mean: a model without these entries in its metadata is refused
     for key, wanted in CONVENTIONS.items():
