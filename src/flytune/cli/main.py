@@ -19,7 +19,7 @@ COMMANDS = (
     evaluate.evaluate,
     evaluate.compare,
     evaluate.report,
-    response_map.response_map,
+    response_map.map,
     tune.tune,
     rules.rules,
     reproduce.reproduce,
@@ -43,8 +43,7 @@ def make_app() -> App:
         default_parameter=Parameter(allow_repeating=True),
     )
     for number, command in enumerate(COMMANDS):
-        name = "map" if command is response_map.response_map else None  # a name that Python has taken
-        app.command(command, name=name, sort_key=number, help_epilogue="")
+        app.command(command, sort_key=number, help_epilogue="")
     return app
 
 

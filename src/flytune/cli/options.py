@@ -16,7 +16,7 @@ TASK_HELP = "a preset (baseline, acrobatic, inspection, or one of them with -ref
 CONTROLLER_HELP = (
     "a run directory, a policy file (.safetensors, .onnx, or a .zip of Stable-Baselines3), a policy that ships "
     "(baseline-refined, or baseline-refined@ppo), or pid, geometric, lqr (with @textbook: gains that were not tuned); "
-    "a policy with a dial may be followed by its setting (dial@speed=0.5)"
+    "a policy with a dial may be followed by its setting (dial@speed=0.5, dial@settling_time=4)"
 )
 
 

@@ -9,7 +9,7 @@ from flytune.cli.options import AsJson, Controller, Whole
 from flytune.errors import BadInput
 
 
-def response_map(
+def map(
     controller: Controller,
     /,
     *,
@@ -22,7 +22,8 @@ def response_map(
 ) -> None:
     """Print the response that each setting of a policy's dial gives."""
     from flytune.control.policy import Policy
-    from flytune.evaluation.response_map import measure_map, response_map
+    from flytune.control.response_map import response_map
+    from flytune.evaluation.measure_map import measure_map
     from flytune.runs.find import find_controller
 
     found = find_controller(controller)

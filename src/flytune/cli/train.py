@@ -31,8 +31,9 @@ def train(
 ) -> None:
     """Train a policy for a task, and print its run directory last."""
     from flytune.control.policy import save_policy
+    from flytune.control.response_map import response_map
     from flytune.evaluation.evaluate import evaluate, write_evaluation
-    from flytune.evaluation.response_map import response_map, with_maps
+    from flytune.evaluation.measure_map import with_maps
     from flytune.runs.directory import new_directory
     from flytune.task.task import load_task
     from flytune.training.loop import train

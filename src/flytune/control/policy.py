@@ -77,7 +77,7 @@ class Policy:
     inputs: dict[str, Input] = dataclasses.field(default_factory=dict)  # of the actor, behind the observation
     setting: dict[str, Any] = dataclasses.field(default_factory=dict)  # dial -> its value
     about: dict[str, Any] = label(default_factory=dict)  # task, vehicle, trainer: in the header of the file
-    maps: dict[str, Any] = label(default_factory=dict)  # dial -> its measured response, see evaluation/response_map.py
+    maps: dict[str, Any] = label(default_factory=dict)  # dial -> its measured response, see control/response_map.py
 
     def __call__(
         self, observation: Float[Array, "*batch 17"], setting: Setting | None = None

@@ -12,6 +12,7 @@ from flytune.config import document
 from flytune.control.classical import CLASSICAL, classical_controller
 from flytune.control.controller import Controller
 from flytune.control.policy import load_policy
+from flytune.control.response_map import response_map
 from flytune.control.schedule import Schedule, with_schedule
 from flytune.errors import BadInput
 from flytune.export.untrusted.onnx_controller import load_onnx
@@ -20,6 +21,7 @@ from flytune.runs.directory import has_checkpoint, read_facts, resume_command
 from flytune.runs.shipped import shipped_files, shipped_names
 from flytune.task.task import Task, load_task, read_task_text
 
+SETTLING_TIME = "settling_time"
 READERS = {".safetensors": load_policy, ".onnx": load_onnx, ".zip": load_sb3}
 KINDS = f"a run directory, a policy file ({', '.join(READERS)}), {', '.join(CLASSICAL)}"
 
@@ -45,6 +47,9 @@ class FoundController:
     def with_dial(self, schedule: Schedule, name: str = "") -> "FoundController":
         """The controller with its dials set or scheduled, see `with_schedule`.
 
+        The name `settling_time` stands for the setting whose median settling time, by the response map that the policy
+        carries, is the value in s.
+
         Raises:
             BadInput: the controller has no dial, an unknown dial, or a value out of range.
         """
@@ -54,6 +59,9 @@ class FoundController:
                 f"{self.name}: has no dial. Allowed: a policy with dials, for instance dial@speed=0.5; "
                 "`flytune train dial` trains one."
             )
+        schedule = dict(schedule)
+        if SETTLING_TIME in schedule and SETTLING_TIME not in controller.dials:
+            schedule |= _by_settling_time(self.name, controller, schedule.pop(SETTLING_TIME))
         return dataclasses.replace(self, controller=with_schedule(controller, schedule), name=name or self.name)
 
     def __repr__(self) -> str:
@@ -73,8 +81,8 @@ def find_controller(name: str, task: str | Task | None = None) -> FoundControlle
 
     A policy file is one of flytune, ONNX or a Stable-Baselines3 model `model.zip`; classical controllers are `pid`,
     `geometric` and `lqr` (gains tuned by search; `pid@textbook` for those of the books). A policy with dials may be
-    followed by a setting, as in `dial@speed=0.5`. `task` is the task to fly, a preset, a TOML file or a task; where
-    None, that of the controller's training, or the baseline.
+    followed by a setting, as in `dial@speed=0.5` or `dial@settling_time=4`. `task` is the task to fly, a preset, a TOML
+    file or a task; where None, that of the controller's training, or the baseline.
 
     Raises:
         BadInput: no controller has this name, or it cannot be used.
@@ -97,6 +105,21 @@ def find_controller(name: str, task: str | Task | None = None) -> FoundControlle
     if name in shipped_names():
         return _shipped(name, wanted)
     raise BadInput(f"{name}: no such controller. Allowed: {KINDS}{''.join(f', {name}' for name in shipped_names())}.")
+
+
+def _by_settling_time(name: str, controller: Any, wanted: Any) -> dict[str, float]:
+    """The setting of a dial that gives a settling time in s, by the response map that a policy carries."""
+    known = response_map(controller)
+    if known is None:
+        raise BadInput(f"{name}: carries no response map. Set its dial: {', '.join(controller.dials)}.")
+    is_number = isinstance(wanted, int | float) and not isinstance(wanted, bool)
+    if not is_number or not known.covers(wanted):
+        fastest, slowest = known.range()
+        raise BadInput(
+            f"settling_time: {wanted} is not allowed. Allowed: {fastest:.2f} to {slowest:.2f} s with {name}; "
+            "`flytune tune --settling-time S` trains a policy for other times."
+        )
+    return {known.dial: known.setting_for(wanted)}
 
 
 def split_setting(name: str) -> tuple[str, dict[str, Any]]:

@@ -7,9 +7,9 @@ from pathlib import Path
 from typing import Any
 
 from flytune.control.policy import Policy, load_policy
+from flytune.control.response_map import response_map
 from flytune.errors import BadInput
 from flytune.evaluation.judge import Judgement
-from flytune.evaluation.response_map import response_map
 from flytune.runs.shipped import shipped_files, shipped_name, shipped_names
 from flytune.task.task import Task, load_task, write_task
 from flytune.tuning.flying import fly_for

@@ -1,22 +1,13 @@
 """The response map of a policy with a dial: what response each setting gives, and which setting gives a response."""
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
-from flytune.control.policy import Policy
 from flytune.errors import BadInput
-from flytune.evaluation.fly import fly
-from flytune.evaluation.judge import AXES, Judgement, judge
-from flytune.evaluation.statistics import bootstrap_interval, median, quantile
 from flytune.tables import Column, Table, number
-from flytune.task.task import Task
-
-SETTINGS, TRIALS, SEED = 20, 100, 2000  # no training, tuning or evaluation flies these initial conditions
-LEAST_SETTLED = 0.95  # of the feasible trials; at a setting with fewer, the map gives no answer
-
 
 COLUMNS = (
     Column("settled", lambda row: row["settled"]),
@@ -67,18 +58,24 @@ class ResponseMap:
         Between two settings, the curve is a line in the logarithms of value and time.
         """
         values, times = self._curve()
-        order = np.argsort(times)
-        return float(np.exp(np.interp(np.log(settling_time), times[order], values[order])))
+        distinct, group = np.unique(times, return_inverse=True)  # settings of one time give their mean
+        means = np.bincount(group, values) / np.bincount(group)
+        return float(np.exp(np.interp(np.log(settling_time), distinct, means)))
 
     def slope(self) -> float:
         """d log(settling time) / d log(value), over the whole range."""
         values, times = self._curve()
         return float((times[-1] - times[0]) / (values[-1] - values[0]))
 
-    def covers(self, settling_time: float) -> bool:
-        """Whether the settling time in s lies between the shortest and the longest of the curve."""
+    def range(self) -> tuple[float, float]:
+        """The shortest and the longest settling time of the curve in s."""
         _, times = self._curve()
-        return bool(times.min() <= np.log(settling_time) <= times.max())
+        return float(np.exp(times.min())), float(np.exp(times.max()))
+
+    def covers(self, settling_time: float) -> bool:
+        """Whether the settling time in s lies between the shortest and the longest of the curve, up to rounding."""
+        fastest, slowest = self.range()
+        return 0.999 * fastest <= settling_time <= 1.001 * slowest
 
     def _curve(self) -> tuple[np.ndarray, np.ndarray]:
         """The logarithms of value and settling time of all settings that settle."""
@@ -107,74 +104,13 @@ class ResponseMap:
             raise BadInput("map: the response map of the policy is damaged. Measure it again: `flytune map`.") from None
 
 
-def measure_map(
-    policy: Policy, task: Task, dial: str | None = None, *, settings: int = SETTINGS, trials: int = TRIALS
-) -> ResponseMap:
-    """The response map of a policy along one of its dials, measured in flight.
-
-    Args:
-        policy: with dials.
-        task: the task of its training.
-        dial: the name of the dial; the first one where None.
-        settings: number of values, even in the spacing of the dial.
-        trials: flights for each value.
-
-    Raises:
-        BadInput: the policy has no such dial.
-    """
-    name = dial or next(iter(policy.dials), "")
-    if name not in policy.dials:
-        raise BadInput(f"dial: {name!r} is no dial of this policy. Allowed: {', '.join(policy.dials) or 'none'}.")
-    values = policy.dials[name].grid(settings)
-    judged = [judge(fly(policy.at({name: value}), task, trials=trials, seed=SEED)) for value in values]
-    return ResponseMap(
-        dial=name,
-        unit=policy.dials[name].unit,
-        trials=trials,
-        seed=SEED,
-        values=values,
-        settled=[each.settled("position") for each in judged],
-        settling_time=[_interval(each.settling_time["position"]) for each in judged],
-        overshoot=[quantile(each.overshoot["position"], 0.9) for each in judged],
-        steady_state_error=[_interval(each.steady_state_error["position"]) for each in judged],
-        peak_speed=[{"median": median(each.peak_speed), "p95": quantile(each.peak_speed, 0.95)} for each in judged],
-        monotone=_monotone([_time(each) for each in judged]),
-    )
-
-
-def response_map(policy: Policy, dial: str | None = None) -> ResponseMap | None:
+def response_map(policy: Any, dial: str | None = None) -> ResponseMap | None:
     """The response map that a policy carries along a dial, the first one where None; None where it carries none."""
     name = dial or next(iter(policy.maps), "")
     return ResponseMap.read(policy.maps[name]) if name in policy.maps else None
 
 
-def with_maps(policy: Policy, task: Task) -> Policy:
-    """The policy with the response map of each of its dials, measured now."""
-    maps = {name: measure_map(policy, task, name).to_dict() for name in policy.dials}
-    return dataclasses.replace(policy, maps=maps)
-
-
-def settled_everywhere(judgement: Judgement) -> float:
-    """The share of the feasible trials that settle on every axis."""
-    settled = np.all([np.isfinite(judgement.settling_time[axis]) for axis in AXES], axis=0)
-    feasible = ~judgement.infeasible
-    return float(np.mean(settled[feasible])) if feasible.any() else 0.0
-
-
-def _time(judgement: Judgement) -> float | None:
-    return median(judgement.settling_time["position"]) if settled_everywhere(judgement) >= LEAST_SETTLED else None
-
-
-def _between(time: Mapping[str, float | None]) -> str:
-    return f"{number(time['low'], 2)} to {number(time['high'], 2)}"
-
-
-def _interval(values: np.ndarray) -> dict[str, float | None]:
-    low, high = bootstrap_interval([values], number=500)
-    return {"median": median(values), "low": low, "high": high}
-
-
-def _monotone(times: list[float | None]) -> list[float | None]:
+def monotone(times: Sequence[float | None]) -> list[float | None]:
     """The times made monotone by the pool-adjacent-violators algorithm on their logarithms; None stays.
 
     Whether they rise or fall is decided by the first and the last.
@@ -183,7 +119,7 @@ def _monotone(times: list[float | None]) -> list[float | None]:
     """
     known = {index: time for index, time in enumerate(times) if time is not None}
     if len(known) < 2:
-        return times
+        return list(times)
     logarithms = np.log(list(known.values()))
     sign = 1.0 if logarithms[-1] >= logarithms[0] else -1.0
     pools: list[tuple[float, int]] = []  # mean and size
@@ -197,3 +133,7 @@ def _monotone(times: list[float | None]) -> list[float | None]:
     for index, value in zip(known, smooth, strict=True):
         result[index] = float(value)
     return result
+
+
+def _between(time: Mapping[str, float | None]) -> str:
+    return f"{number(time['low'], 2)} to {number(time['high'], 2)}"

@@ -1,0 +1,84 @@
+"""Flights with a dial: the bound that follows it, turned in flight, in every simulator, in exports."""
+
+import numpy as np
+import pytest
+
+from flytune import evaluate, find_controller, fly, judge, load_task
+from flytune.control.schedule import with_schedule
+from flytune.errors import BadInput
+
+FAMILY = load_task("dial")
+POLICY = find_controller("dial").controller
+TRIALS = 20
+
+
+def test_the_bound_of_a_flight_is_that_of_the_setting():
+    for speed in (0.3, 1.0):
+        flights = fly(POLICY.at(speed=speed), FAMILY, trials=TRIALS)
+        assert flights.speed_bound == pytest.approx(speed)
+        velocity = np.linalg.norm(flights.velocity, axis=-1)
+        np.testing.assert_allclose(flights.margins["speed"], 1 - velocity / speed, atol=1e-5)
+    # a controller without a dial flies the default
+    assert fly(find_controller("pid", FAMILY), FAMILY, trials=2, duration=1.0).speed_bound == pytest.approx(0.8)
+
+
+@pytest.mark.parametrize("to", [0.2, 1.6])
+@pytest.mark.parametrize("at", [0.05, 0.3, 1.0, 2.0, 4.0, 8.0])
+def test_the_dial_may_be_turned_at_every_phase_of_a_flight(at, to):
+    start = 1.8 - to
+    flights = fly(with_schedule(POLICY, {"speed": [[0, start], [at, to]]}), FAMILY, trials=TRIALS, duration=at + 8.0)
+    judged = judge(flights)
+    assert judged.crashed.sum() == 0
+    speed = np.linalg.norm(flights.velocity, axis=-1)
+    assert speed[:, round(100 * (at + 2.0)) :].max() <= to  # 2 s after the turn, the bound of the new setting is kept
+    jump = np.abs(np.diff(flights.action, axis=1)).max(axis=-1)
+    # the turn itself changes no action more than flying does
+    assert jump[:, round(100 * at)].max() <= max(0.2, jump[:, 5:].max())
+
+
+def test_a_turn_moves_the_dial_no_faster_than_its_sweep_time():
+    sweep_time = float(FAMILY.dial["speed"].sweep_time)
+    turned = with_schedule(POLICY, {"speed": [[0, 0.2], [1.0, 1.6]]})
+    values = turned.settings(500)["speed"]
+    assert values[:100] == pytest.approx(0.2)
+    shares = np.log(values / 0.2) / np.log(1.6 / 0.2)
+    assert np.diff(shares).max() == pytest.approx(0.01 / sweep_time, rel=1e-3)
+    assert values[round(100 * (1.0 + sweep_time)) + 1] == pytest.approx(1.6)
+    # the margins of a flight are those of the setting at which the dial stands at each sample
+    flights = fly(turned, FAMILY, trials=2, duration=4.0)
+    velocity = np.linalg.norm(flights.velocity, axis=-1)
+    np.testing.assert_allclose(flights.margins["speed"], 1 - velocity / values[:401], atol=1e-4)
+    assert flights.speed_bound == pytest.approx(1.6)
+
+
+def test_a_schedule_flies_the_same_in_another_simulator():
+    pytest.importorskip("mujoco")
+    schedule = {"speed": [[0, 0.4], [2.0, 1.2]]}
+    here, there = (
+        evaluate("dial", dial=schedule, simulator=simulator, trials=5, duration=6.0).flights
+        for simulator in ("flytune", "mujoco")
+    )
+    assert np.abs(here.position - there.position).max() < 0.05
+
+
+def test_a_schedule_flies_the_same_from_an_onnx_file(tmp_path):
+    pytest.importorskip("onnxruntime")
+    from flytune import export_policy
+
+    path = export_policy(POLICY, tmp_path / "dial.onnx")
+    schedule = {"speed": [[0, 0.4], [2.0, 1.2]]}
+    here, there = (
+        evaluate(name, FAMILY, dial=schedule, trials=5, duration=5.0).flights for name in ("dial", str(path))
+    )
+    assert np.abs(here.position - there.position).max() < 1e-3
+    fixed = export_policy(POLICY.at(speed=0.4).fixed(), tmp_path / "fixed.onnx")
+    again = evaluate(str(fixed), FAMILY.at({"speed": 0.4}), trials=5, duration=5.0).flights
+    same = evaluate("dial@speed=0.4", trials=5, duration=5.0).flights
+    assert np.abs(again.position - same.position).max() < 1e-3
+
+
+def test_a_controller_without_a_dial_refuses_a_setting():
+    with pytest.raises(BadInput, match="lqr: has no dial"):
+        evaluate("lqr", dial={"speed": 0.3})
+    with pytest.raises(BadInput, match="baseline-refined: has no dial"):
+        find_controller("baseline-refined@speed=0.3")
