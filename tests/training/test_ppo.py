@@ -204,8 +204,7 @@ def test_the_kernel_and_jax_learn_the_same(small_task, monkeypatch, apart, final
         learning_rate=3e-3,
     )
     train_state = ppo.start(small_task, settings, jax.random.key(0))
-    _, batch, _ = ppo.rollout(small_task, settings, train_state.parameters, train_state.episodes, jax.random.key(1))
-    batch = jax.tree.map(ppo._flat, batch)
+    batch = small_batch(train_state.parameters, size=64)
     found = []
     for kernels in (True, False):
         monkeypatch.setattr(ppo, "available", lambda kernels=kernels: kernels)
@@ -222,7 +221,7 @@ def test_the_kernel_and_jax_learn_the_same(small_task, monkeypatch, apart, final
 
 def test_an_update_works_without_kernels_with_an_odd_batch_and_in_a_trace(small_task, monkeypatch):
     monkeypatch.setenv("FLYTUNE_KERNELS", "0")
-    settings = dataclasses.replace(small_task.ppo, environments=3, rollout=16, minibatch=24, epochs=3)
+    settings = dataclasses.replace(small_task.ppo, environments=3, rollout=8, minibatch=12, epochs=3)
     train_state = ppo.start(small_task, settings, jax.random.key(0))
     traced, measured = jax.jit(ppo.update, static_argnums=1)(small_task, settings, train_state)
     after, same = ppo.update(small_task, settings, train_state)

@@ -8,8 +8,7 @@ in the same functions, so the results are the same bit by bit.
 from collections.abc import Sequence
 
 EMPTY = -1082130432  # the bits of -1.0
-SPINS = 1000  # looks at an empty cell before the thread sleeps, so that another one may run on its core
-SLEEP = 50  # us
+SPINS = 20  # looks at an empty cell before other threads may run on this core: few, as it may be the other one
 
 
 def exchange_functions(processor: str) -> list[str]:
@@ -24,7 +23,7 @@ def exchange_functions(processor: str) -> list[str]:
     declared = ["declare void @llvm.x86.sse2.pause()"] if pause else []
     return [
         *declared,
-        "declare i32 @usleep(i32)",
+        "declare i32 @sched_yield()",
         f"define internal void @empty(ptr %cell) {{\n  store i32 {EMPTY}, ptr %cell, align 4\n  ret void\n}}",
         "\n".join(
             [
@@ -53,7 +52,7 @@ def exchange_functions(processor: str) -> list[str]:
                 "  %more = add nuw i32 %looks, 1",
                 "  br label %look",
                 "offer:",
-                f"  %ignored = call i32 @usleep(i32 {SLEEP})",
+                "  %ignored = call i32 @sched_yield()",
                 "  br label %look",
                 "end:",
                 "  ret void",

@@ -120,6 +120,8 @@ def _functions(plan: _Plan, descent: Descent) -> list[str]:
             for part in chosen:
                 part.descend(writer, t)
 
+        for part in chosen:
+            part.gather(writer, "0")
         writer.each(plan.steps, step)
         texts.append(writer.function(name, 7, 7, shared=True))
     writer = Writer()
@@ -194,7 +196,7 @@ class _Part:
         return writer.function(f"measure{self._index}", 2, 3)
 
     def find_gradient(self, writer: Writer, t: str) -> None:
-        """Write the instructions that find and publish the gradient of minibatch t."""
+        """Write the instructions that find and publish the gradient of minibatch t, whose samples are collected."""
         learner, k, width, room = self.learner, self._index, self._plan.width, self._room
         state, numbers = self._two_states(writer, t)[0], self._numbers(writer, t)
 
@@ -207,12 +209,18 @@ class _Part:
         activations, spare, recorded = list(map(at, room.activations)), list(map(at, room.spare)), at(room.recorded)
         rest, given = writer.at(sample, learner.sizes[0] * width), writer.at(state, parameters_of(learner.sizes))
         record = writer.at(self._records, writer.times(writer.remainder(t, self._plan.kept), learner.recorded))
-        writer.call(f"gather{k}", writer.at("%in1", writer.times(t, width)), self._samples, sample)
         writer.call(f"forward{k}", state, sample, *activations)
         writer.call(f"cost{k}", given, numbers, activations[-1], rest, outputs, further, recorded)
         writer.call(f"backward{k}", state, sample, *activations, outputs, gradient, square, *spare)
         writer.call(f"measure{k}", further, recorded, gradient, square, record)
         writer.call("publish", square, self._cell(writer, t, k))
+        # not later, because the other learner may need the time until it has published its own
+        self.gather(writer, writer.remainder(writer.times(t, 1, 1), self._plan.steps))
+
+    def gather(self, writer: Writer, t: str) -> None:
+        """Write the instructions that collect the samples of minibatch t."""
+        order, sample = writer.at("%in1", writer.times(t, self._plan.width)), writer.at(self._memory, self._room.sample)
+        writer.call(f"gather{self._index}", order, self._samples, sample)
 
     def descend(self, writer: Writer, t: str) -> None:
         """Write the instructions that wait for the other's gradient of minibatch t and make the step."""

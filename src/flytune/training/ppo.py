@@ -175,9 +175,9 @@ def rollout(
         return memory, action, (seen, mean, action)
 
     (episodes, _), step = simulate(
-        task, decide, (episodes, ()), draws, record=lambda after, moved, outcome: (outcome, moved)
+        task, decide, (episodes, ()), draws, record=lambda after, moved, outcome: (outcome, moved.reward, moved.steps)
     )
-    (seen, mean, action), following, (outcome, moved) = step.notes, step.following * factor, step.record
+    (seen, mean, action), following, (outcome, rewards, lengths) = step.notes, step.following * factor, step.record
     value, next_value = (
         _outputs(parameters.critic, each.reshape(-1, SIZE)).reshape(steps, width) for each in (seen, following)
     )
@@ -197,7 +197,7 @@ def rollout(
         advantage=advantage,
         target=advantage + value,
     )
-    return episodes, batch, rollout_sums(task, outcome, moved.reward, moved.steps)
+    return episodes, batch, rollout_sums(task, outcome, rewards, lengths)
 
 
 def _outputs(network: Network, inputs: Float[Array, "batch inputs"]) -> Float[Array, "batch outputs"]:
