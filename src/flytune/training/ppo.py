@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
+from jax.core import Tracer
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, UInt32
 
@@ -29,7 +30,9 @@ from flytune.task.task import Task
 from flytune.task.training_settings import PpoSettings
 from flytune.training.epochs import B1, B2, EPS, learn_in_threads
 from flytune.training.surrogate import entropy, learning_rate, log_probability, spread, surrogate
-from flytune.training.update import PARTS, averaged, cores, descend, in_threads, metrics_of, rollout_sums
+from flytune.training.update import PARTS, BusyCores, averaged, descend, in_threads, metrics_of, rollout_sums
+
+_busy_cores = BusyCores()
 
 
 @pytree
@@ -108,7 +111,9 @@ def update(task: Task, settings: PpoSettings, train_state: TrainState) -> tuple[
         )
 
     parts = in_threads(part, number, train_state.updates)
-    return _learn(settings, train_state, parts, np.int32(cores()))
+    if isinstance(train_state.updates, Tracer):
+        return _learn(settings, train_state, parts, np.int32(1))
+    return _busy_cores.run(lambda threads: _learn(settings, train_state, parts, np.int32(threads)))
 
 
 @program(static=["settings", "number"])

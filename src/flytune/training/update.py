@@ -4,6 +4,7 @@ import ctypes
 import math
 import os
 import sys
+import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from functools import lru_cache
@@ -72,6 +73,30 @@ def in_threads(part: Callable[[int], T], number: int, tracer: Any) -> tuple[T, .
 @lru_cache
 def _threads() -> ThreadPoolExecutor:
     return ThreadPoolExecutor(PARTS, "flytune-part")
+
+
+class BusyCores:
+    """How many threads work on one problem together, which pays only where both find a core of their own at once.
+
+    Beside other load, two threads that wait for each other are slower than one. Then one works, and two try again
+    after some updates.
+    """
+
+    FREE, PAUSE = 1.75, 15  # seconds of processor per second that show free cores; updates in one thread after fewer
+
+    def __init__(self) -> None:
+        self._pause = 0
+
+    def run(self, work: Callable[[int], T]) -> T:
+        """`work` of a number of threads, 1 or 2; its result does not depend on it."""
+        if cores() == 1 or self._pause:
+            self._pause = max(0, self._pause - 1)
+            return work(1)
+        wall, processor = time.perf_counter(), time.process_time()
+        result = jax.block_until_ready(work(PARTS))
+        if time.process_time() - processor < self.FREE * (time.perf_counter() - wall):
+            self._pause = self.PAUSE
+        return result
 
 
 def descend(optimiser: optax.GradientTransformation, gradient: T, memory: Any, parameters: T) -> tuple[T, Any]:
