@@ -1,6 +1,10 @@
 """Proximal policy optimisation: its arithmetic, and that it learns."""
 
 import dataclasses
+import functools
+import os
+import subprocess
+import sys
 
 import jax
 import jax.numpy as jnp
@@ -186,3 +190,79 @@ def test_ppo_learns_to_survive_and_to_earn_more_within_half_a_million_steps():
         train_state, last = ppo.update(task, task.ppo, train_state)
     assert float(last["episode_length"]) > 5 * float(first["episode_length"])
     assert float(last["reward"]) > float(first["reward"]) + 0.05
+
+
+@pytest.mark.parametrize("apart", [False, True])
+@pytest.mark.parametrize("final_learning_rate", [1.0, 0.1])
+def test_the_kernel_and_jax_learn_the_same(small_task, monkeypatch, apart, final_learning_rate):
+    settings = dataclasses.replace(
+        small_task.ppo,
+        separate_grad_clipping=apart,
+        final_learning_rate=final_learning_rate,
+        max_grad_norm=0.05,
+        entropy_weight=0.01,
+        learning_rate=3e-3,
+    )
+    train_state = ppo.start(small_task, settings, jax.random.key(0))
+    batch = small_batch(train_state.parameters, size=64)
+    found = []
+    for kernels in (True, False):
+        monkeypatch.setattr(ppo, "available", lambda kernels=kernels: kernels)
+        before = train_state.parameters, train_state.optimiser
+        for key in jax.random.split(jax.random.key(2), 3):
+            *before, losses = ppo.learn(settings, *before, batch, key)
+        found.append((*before, losses))
+    for kernel, wanted in zip(jax.tree.leaves(found[0]), jax.tree.leaves(found[1]), strict=True):
+        np.testing.assert_allclose(kernel, wanted, rtol=1e-3, atol=2e-6)
+    assert jax.tree.structure(found[0]) == jax.tree.structure(found[1])
+    change = ravel_pytree(found[0][0])[0] - ravel_pytree(train_state.parameters)[0]
+    assert np.median(np.abs(change)) > 1e-2  # else the above says little
+
+
+def test_an_update_works_without_kernels_with_an_odd_batch_and_in_a_trace(small_task, monkeypatch):
+    monkeypatch.setenv("FLYTUNE_KERNELS", "0")
+    settings = dataclasses.replace(small_task.ppo, environments=3, rollout=8, minibatch=12, epochs=3)
+    train_state = ppo.start(small_task, settings, jax.random.key(0))
+    traced, measured = jax.jit(ppo.update, static_argnums=1)(small_task, settings, train_state)
+    after, same = ppo.update(small_task, settings, train_state)
+    np.testing.assert_allclose(ravel_pytree(after.parameters)[0], ravel_pytree(traced.parameters)[0], atol=1e-5)
+    assert float(same["value_loss"]) == pytest.approx(float(measured["value_loss"]), rel=1e-4)
+    assert after.episodes.steps.shape == (3,)
+
+
+def test_several_seeds_as_one_batch_learn_as_each_alone(small_task):
+    keys = jax.random.split(jax.random.key(0), 2)
+    start, update = (functools.partial(each, small_task, small_task.ppo) for each in (ppo.start, ppo.update))
+    together, _ = jax.jit(jax.vmap(update))(jax.vmap(start)(keys))
+    for index, key in enumerate(keys):
+        alone, _ = update(start(key))
+        found = ravel_pytree(jax.tree.map(lambda leaf, index=index: leaf[index], together.parameters))[0]
+        np.testing.assert_allclose(found, ravel_pytree(alone.parameters)[0], atol=1e-5)
+
+
+SCRIPT = """
+import hashlib, os, sys
+if sys.argv[1] == "one":
+    os.sched_setaffinity(0, [min(os.sched_getaffinity(0))])
+import jax, numpy as np
+from flytune.task.task import load_task
+from flytune.training import ppo
+settings = {"ppo.environments": 6, "ppo.rollout": 32, "ppo.minibatch": 24, "ppo.epochs": 3, "ppo.hidden": [16, 16]}
+task = load_task("baseline", settings)
+state = ppo.start(task, task.ppo, jax.random.key(0))
+for _ in range(3):
+    state, metrics = ppo.update(task, task.ppo, state)
+leaves = jax.tree.leaves((state.parameters, state.ema, state.optimiser, state.episodes, metrics))
+print(hashlib.sha256(b"".join(np.asarray(leaf).tobytes() for leaf in leaves)).hexdigest())
+"""
+
+
+@pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="this system cannot take cores from a process")
+def test_one_core_and_two_give_the_same_bits():
+    def run(cores, **variables):
+        environment = {**os.environ, **variables}
+        command = [sys.executable, "-c", SCRIPT, cores]
+        return subprocess.run(command, env=environment, capture_output=True, text=True, check=True).stdout
+
+    runs = run("one"), run("all"), run("all", FLYTUNE_CORES="1")
+    assert len(runs[0]) > 60 and len(set(runs)) == 1

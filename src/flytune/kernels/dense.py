@@ -57,6 +57,11 @@ def _places(sizes: Sequence[int]) -> list[int]:
     return [0, *itertools.accumulate(lengths)]
 
 
+def parameters_of(sizes: Sequence[int]) -> int:
+    """The number of parameters of a perceptron."""
+    return _places(sizes)[-1]
+
+
 @pytree
 class Actor:
     """A perceptron that gives the actions in a rollout. The loop over time is then part of the kernel, see `window`."""
@@ -116,10 +121,13 @@ def forward_function(name: str, sizes: tuple[int, ...], number: int, squash: boo
 
 
 @functools.cache
-def backward_function(name: str, sizes: tuple[int, ...], number: int, squash: bool, add: bool = False) -> str:
+def backward_function(
+    name: str, sizes: tuple[int, ...], number: int, squash: bool, add: bool = False, below: bool = True
+) -> str:
     """In LLVM: parameters, inputs, activations, cotangent -> cotangents of parameters and inputs.
 
-    Three more outputs are room to work in. The cotangents of the parameters may be added to what is there.
+    Three more outputs are room to work in. The cotangents of the parameters may be added to what is there; those of
+    the inputs are left out where `below` is False.
     """
     count, places = len(sizes) - 1, _places(sizes)
     writer, given = Writer(), f"%in{2 + count}"
@@ -130,13 +138,14 @@ def backward_function(name: str, sizes: tuple[int, ...], number: int, squash: bo
             slope = spare[0]
             writer.elementwise(lambda g, h: g * (1.0 - h * h), [given, f"%in{2 + layer}"], slope, more * number)
             given, spare = slope, spare[::-1]
-        below = f"%in{1 + layer}"  # the activations of the layer before, or the inputs
+        source = f"%in{1 + layer}"  # the activations of the layer before, or the inputs
         writer.transpose(given, turned, more, number)
         to = writer.at("%out0", places[layer])
-        writer.product((fewer, more, number), (below, number, 1), (turned, more), (to, more), add=add)
+        writer.product((fewer, more, number), (source, number, 1), (turned, more), (to, more), add=add)
         writer.sum_rows(turned, writer.at("%out0", places[count + layer]), number, more, add=add)
         weight, target = writer.at("%in0", places[layer]), spare[0] if layer else "%out1"
-        writer.product((fewer, number, more), (weight, more, 1), (given, number), (target, number))
+        if layer or below:
+            writer.product((fewer, number, more), (weight, more, 1), (given, number), (target, number))
         given, spare = target, spare[::-1]
     return writer.function(name, 3 + count, 5)
 
@@ -282,6 +291,28 @@ class Writer:
 
         self._columns(columns, block)
 
+    def total(self, source: str, out: str, number: int, *, square: bool = False) -> None:
+        """out[0] = the sum of source[i], or of its squares."""
+        width = 2 * vector_width()
+        kind, last = _vector(width), number % width
+        sums = self._register(width)
+        self._store("zeroinitializer", sums, width)
+
+        def add(index: str) -> None:
+            value = self._load(self.at(source, self._new(f"mul i64 {index}, {width}")), width)
+            value = self._new(f"fmul {kind} {value}, {value}") if square else value
+            self._store(self._new(f"fadd {kind} {self._load(sums, width)}, {value}"), sums, width)
+
+        if number >= width:
+            self.each(number // width, add)
+        name = f"@llvm.vector.reduce.fadd.v{width}f32"
+        result = self._new(f"call float {name}(float {ZERO}, {kind} {self._load(sums, width)})")
+        for index in range(number - last, number):
+            value = self._load(self.at(source, index))
+            value = self._new(f"fmul float {value}, {value}") if square else value
+            result = self._new(f"fadd float {result}, {value}")
+        self._store(result, out)
+
     def elementwise(self, formula: Callable[..., Any], sources: Sequence[str], out: str, number: int) -> None:
         """out[i] = formula(sources[i]), a function in JAX of numbers."""
         traced = jax.make_jaxpr(formula)(*[jax.ShapeDtypeStruct((), jnp.float32)] * len(sources))
@@ -347,6 +378,15 @@ class Writer:
         """out[i] = source[i], or 0 where there is no source."""
         self.each(number, lambda i: self._store(self._load(self.at(source, i)) if source else ZERO, self.at(out, i)))
 
+    def copy_one(self, source: str, out: str) -> None:
+        """out[0] = source[0]."""
+        self._store(self._load(source), out)
+
+    def row(self, source: str, index: str, columns: int) -> str:
+        """The pointer to the row of a matrix whose index, an integer, is in memory."""
+        row = self._new(f"zext i32 {self._new(f'load i32, ptr {index}, align 4')} to i64")
+        return self.at(source, self.times(row, columns))
+
     def call(self, name: str, *pointers: str) -> None:
         """A call of a function in LLVM, see `native.function`."""
         self._lines.append(f"  call void @{name}({', '.join(f'ptr {pointer}' for pointer in pointers)})")
@@ -356,9 +396,13 @@ class Writer:
         product = self._new(f"mul i64 {index}, {factor}")
         return self._new(f"add i64 {product}, {before}")
 
-    def function(self, name: str, inputs: int, outputs: int) -> str:
+    def remainder(self, index: str, divisor: int) -> str:
+        """index modulo divisor."""
+        return self._new(f"urem i64 {index}, {divisor}")
+
+    def function(self, name: str, inputs: int, outputs: int, *, shared: bool = False) -> str:
         """The function in LLVM, see `native.function`."""
-        return function(name, inputs, outputs, ["entry:", *self._room, *self._lines])
+        return function(name, inputs, outputs, ["entry:", *self._room, *self._lines], shared=shared)
 
 
 def _vector(width: int) -> str:

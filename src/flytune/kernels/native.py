@@ -31,6 +31,7 @@ DECLARATIONS = (
         f"declare <{width} x float> @llvm.fmuladd.v{width}f32({', '.join([f'<{width} x float>'] * 3)})"
         for width in range(1, 33)
     ),
+    *(f"declare float @llvm.vector.reduce.fadd.v{width}f32(float, <{width} x float>)" for width in (8, 16, 32)),
 )
 LOOP_METADATA = (
     "!0 = distinct !{!0, !1, !2, !3}",
@@ -54,9 +55,13 @@ def module(functions: Sequence[str], main: str, inputs: int, outputs: int) -> tu
     return name, text.replace("@KERNEL", f"@{name}")
 
 
-def function(name: str, inputs: int, outputs: int, body: Sequence[str]) -> str:
-    """A function in LLVM of pointers %in0, ... and %out0, ..., which do not overlap."""
-    arguments = ", ".join(f"ptr noalias {buffer}" for buffer in _buffers(inputs, outputs))
+def function(name: str, inputs: int, outputs: int, body: Sequence[str], *, shared: bool = False) -> str:
+    """A function in LLVM of pointers %in0, ... and %out0, ..., which do not overlap.
+
+    With `shared`, another thread may read and write what they point to.
+    """
+    kind = "ptr" if shared else "ptr noalias"
+    arguments = ", ".join(f"{kind} {buffer}" for buffer in _buffers(inputs, outputs))
     return "\n".join([f"define internal void @{name}({arguments}) noinline {{", *body, "  ret void", "}"])
 
 
@@ -188,6 +193,13 @@ def vector_width() -> int:
 
     features = binding.get_host_cpu_features()
     return 16 if features.get("avx512f") else 8 if features.get("avx") else 4
+
+
+def architecture() -> str:
+    """The name of the architecture of this processor, for instance x86_64."""
+    from llvmlite import binding
+
+    return binding.get_process_triple().split("-")[0]
 
 
 @functools.cache

@@ -7,7 +7,6 @@ which takes a third of the time.
 
 import dataclasses
 import functools
-import itertools
 from collections.abc import Callable
 from typing import Any
 
@@ -17,7 +16,7 @@ from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, Float, UInt32
 
 from flytune.kernels.batched import Kernel, Prepared, words
-from flytune.kernels.dense import Actor, Writer, backward_function, forward_function
+from flytune.kernels.dense import Actor, Writer, backward_function, forward_function, parameters_of
 from flytune.kernels.native import loop, module, register
 
 
@@ -191,7 +190,7 @@ def _backward_functions(spec: _Spec) -> list[str]:
         writer.call("look", *common, here, at(noise, 2), inputs, seen)
         writer.elementwise(lambda a, b: a + b, [moved, seen], carried, width * number)
 
-    writer.copy(None, gradient, _parameters(sizes))
+    writer.copy(None, gradient, parameters_of(sizes))
     writer.copy(final, carried, width * number)
     writer.each(spec.steps, step)
     look = spec.look.gradient_jaxpr([shared], [0])
@@ -202,7 +201,3 @@ def _backward_functions(spec: _Spec) -> list[str]:
         loop("move", move, spec.batched(5), number),
         writer.function("window", shared + 6 + len(sizes), 9),
     ]
-
-
-def _parameters(sizes: tuple[int, ...]) -> int:
-    return sum((fewer + 1) * more for fewer, more in itertools.pairwise(sizes))

@@ -17,6 +17,7 @@ from flytune.errors import BadInput, Diverged, Interrupted
 from flytune.reproduction.study import BEHAVIOURS, Study, Training, training_status
 from flytune.task.task import write_task
 from flytune.training.loop import Progress
+from flytune.training.update import CORES, cores
 
 ATTEMPTS = 3  # of one training whose process was killed
 
@@ -55,8 +56,9 @@ def train_all(
     unfinished = [training for training in status if status[training] != "finished"]
     if len(unfinished) < len(status):
         on_message(f"{len(status) - len(unfinished)} of {len(status)} trainings were done before")
-    processes = _Processes(study, on_progress, on_message)
-    with ThreadPoolExecutor(workers or free_cores()) as pool:
+    number = workers or free_cores()
+    processes = _Processes(study, on_progress, on_message, max(1, cores() // number))
+    with ThreadPoolExecutor(number) as pool:
         futures = [pool.submit(processes.train, training, status[training] == "interrupted") for training in unfinished]
         try:
             wait(futures, return_when=FIRST_EXCEPTION)
@@ -84,9 +86,11 @@ class _Processes:
         study: Study,
         on_progress: Callable[[Training, Progress], None],
         on_message: Callable[[str], None],
+        cores_each: int,
     ) -> None:
         """Write the task files that the processes read."""
         self.study, self.on_progress, self.on_message = study, on_progress, on_message
+        self.environment = {**os.environ, CORES: str(cores_each)}
         self.tasks = {behaviour: study.folder / f"{study.preset(behaviour)}.toml" for behaviour in BEHAVIOURS}
         for behaviour, path in self.tasks.items():
             write_text(path, write_task(study.task(behaviour)))
@@ -136,6 +140,7 @@ class _Processes:
                 [sys.executable, "-m", "flytune.reproduction.worker", json.dumps(order)],
                 stdout=subprocess.PIPE,
                 stderr=subprocess.PIPE,
+                env=self.environment,
                 text=True,
                 start_new_session=True,
             )

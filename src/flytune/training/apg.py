@@ -6,8 +6,6 @@ episode has no gradient; so each termination condition also adds a smooth barrie
 """
 
 import dataclasses
-from concurrent.futures import ThreadPoolExecutor
-from functools import lru_cache
 from typing import Any
 
 import jax
@@ -15,7 +13,6 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 import optax.contrib
-from jax.core import Tracer
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
@@ -28,9 +25,16 @@ from flytune.simulation.rollout import Draw, reset_all, rollout, split_keys
 from flytune.task.observation import SIZE, input_scale
 from flytune.task.task import Task
 from flytune.task.training_settings import ApgSettings
-from flytune.training.update import averaged, cores, descend, metrics_of, network_scale, rollout_sums, turned
-
-PARTS = 2  # of a batch, which two cores can compute at the same time
+from flytune.training.update import (
+    PARTS,
+    averaged,
+    descend,
+    in_threads,
+    metrics_of,
+    network_scale,
+    rollout_sums,
+    turned,
+)
 
 
 @pytree
@@ -117,18 +121,9 @@ def update(task: Task, settings: ApgSettings, train_state: TrainState) -> tuple[
     number = PARTS if settings.environments % PARTS == 0 else 1
 
     def part(index: int) -> Any:
-        return jax.block_until_ready(
-            _part(task, settings, number, train_state.actor, train_state.episodes, train_state.key, np.int32(index))
-        )
+        return _part(task, settings, number, train_state.actor, train_state.episodes, train_state.key, np.int32(index))
 
-    traced = isinstance(train_state.updates, Tracer)  # a thread of its own would not know of the trace
-    parts = _threads().map(part, range(number)) if cores() > 1 and not traced else map(part, range(number))
-    return _descend(settings, train_state, tuple(parts))
-
-
-@lru_cache
-def _threads() -> ThreadPoolExecutor:
-    return ThreadPoolExecutor(PARTS, "flytune-apg")
+    return _descend(settings, train_state, in_threads(part, number, train_state.updates))
 
 
 @program(static=["settings", "number"])

@@ -3,38 +3,54 @@
 Where the paper gives no detail, this follows Stable-Baselines3 2.x: a diagonal Gaussian whose standard deviation does
 not depend on the state, advantages normalised per minibatch, gradients clipped by their global norm. An episode that
 its horizon truncates counts with the value of its last state; after a failure nothing counts (Pardo et al. 2018).
-One update is one compiled function: a rollout and twelve epochs.
+One update is a rollout, in two parts, and twelve epochs.
 """
 
 import dataclasses
-import math
 from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import optax
+from jax.core import Tracer
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, UInt32
 
 from flytune.config.pytree import pytree
 from flytune.control.policy import Network, Policy, make_network
+from flytune.kernels.batched import available
 from flytune.kernels.dense import perceptron
 from flytune.kernels.programs import program
-from flytune.simulation.environment import Episode
+from flytune.simulation.environment import Episode, Outcome
 from flytune.simulation.rollout import Draw, reset_all
 from flytune.simulation.rollout import rollout as simulate
-from flytune.task.observation import SIZE, input_scale
+from flytune.task.observation import input_scale
 from flytune.task.task import Task
 from flytune.task.training_settings import PpoSettings
-from flytune.training.update import averaged, descend, rollout_metrics
+from flytune.training.epochs import B1, B2, EPS, learn_in_threads
+from flytune.training.surrogate import entropy, learning_rate, log_probability, spread, surrogate
+from flytune.training.update import (
+    PARTS,
+    BusyCores,
+    averaged,
+    descend,
+    in_threads,
+    metrics_of,
+    network_scale,
+    rollout_sums,
+    turned,
+)
+
+_busy_cores = BusyCores()
 
 
 @pytree
 class Parameters:
     """The parameters that the gradient changes."""
 
-    actor: Network  # 17 -> mean of the action
-    critic: Network  # 17 -> value
+    actor: Network  # observation and further inputs -> mean of the action
+    critic: Network  # the same -> value
     log_std: Float[Array, "4"]
 
 
@@ -54,7 +70,7 @@ class TrainState:
 class Batch:
     """Samples of a rollout, along the first axis or axes."""
 
-    observation: Float[Array, "*batch 17"]
+    observation: Float[Array, "*batch inputs"]  # scaled
     action: Float[Array, "*batch 4"]  # as drawn, before clipping
     log_probability: Float[Array, "*batch"]
     advantage: Float[Array, "*batch"]
@@ -76,8 +92,8 @@ def start(task: Task, settings: PpoSettings, key: Array) -> TrainState:
     """The training state before the first update."""
     actor_key, critic_key, episode_key, key = jax.random.split(key, 4)
     parameters = Parameters(
-        actor=make_network(actor_key, (SIZE, *settings.hidden, 4), last_gain=0.01),
-        critic=make_network(critic_key, (SIZE, *settings.hidden, 1), last_gain=1.0),
+        actor=make_network(actor_key, (task.inputs, *settings.hidden, 4), last_gain=0.01),
+        critic=make_network(critic_key, (task.inputs, *settings.hidden, 1), last_gain=1.0),
         log_std=jnp.full(4, settings.initial_log_std, float),
     )
     keys = jax.random.split(episode_key, settings.environments)
@@ -91,30 +107,72 @@ def start(task: Task, settings: PpoSettings, key: Array) -> TrainState:
     )
 
 
-@program(static=["settings"], donate=["train_state"])
 def update(task: Task, settings: PpoSettings, train_state: TrainState) -> tuple[TrainState, dict[str, Any]]:
-    """The training state after one update, and its metrics."""
-    key, rollout_key, shuffle_key = jax.random.split(train_state.key, 3)
-    episodes, batch, seen = rollout(task, settings, train_state.parameters, train_state.episodes, rollout_key)
-    flat = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), batch)
-    parameters, optimiser, losses = learn(settings, train_state.parameters, train_state.optimiser, flat, shuffle_key)
+    """The training state after one update, and its metrics.
+
+    The rollout is computed in parts, and actor and critic learn apart. On two cores both happen at the same time; the
+    numbers are the same bit by bit.
+    """
+    number = PARTS if settings.environments % PARTS == 0 else 1
+
+    def part(index: int) -> Any:
+        return _part(
+            task, settings, number, train_state.parameters, train_state.episodes, train_state.key, np.int32(index)
+        )
+
+    parts = in_threads(part, number, train_state.updates)
+    if isinstance(train_state.updates, Tracer):
+        return _learn(settings, train_state, parts, np.int32(1))
+    return _busy_cores.run(lambda threads: _learn(settings, train_state, parts, np.int32(threads)))
+
+
+@program(static=["settings", "number"])
+def _part(
+    task: Task, settings: PpoSettings, number: int, parameters: Parameters, episodes: Episode, key: Array, index: Array
+) -> tuple[Episode, Batch, dict[str, Any], Array]:
+    """A part of the episodes after a rollout, its samples and sums, and the orders of a part of the epochs."""
+    width, epochs = settings.environments // number, -(-settings.epochs // number)
+    mine = jax.tree.map(lambda leaf: jax.lax.dynamic_slice_in_dim(leaf, index * width, width, axis=-1), episodes)
+    mine = turned(task, mine, jax.random.fold_in(jax.random.fold_in(key, index), 2))
+    rollout_key, shuffle_key = jax.random.split(jax.random.fold_in(key, index))
+    narrow = dataclasses.replace(settings, environments=width)
+    samples = settings.environments * settings.rollout
+    keys = jax.random.split(shuffle_key, epochs)
+    return *rollout(task, narrow, parameters, mine, rollout_key), orders(keys, samples)
+
+
+@program(static=["settings"], donate=["train_state"])
+def _learn(settings: PpoSettings, train_state: TrainState, parts: tuple[Any, ...], threads: Array) -> Any:
+    """The training state after all epochs over the samples of all parts, and the metrics."""
+    episodes, batches, sums, shuffled = zip(*parts, strict=True)
+    batch = jax.tree.map(lambda *leaves: _flat(jnp.concatenate(leaves, axis=1)), *batches)
+    total = jax.tree.map(lambda *leaves: sum(leaves[1:], start=leaves[0]), *sums)
+    order = jnp.concatenate(shuffled)[: settings.epochs]
+    before = train_state.parameters, train_state.optimiser
+    parameters, optimiser, losses = learn_in_order(settings, *before, batch, order, threads)
     after = TrainState(
         parameters=parameters,
         ema=averaged(train_state.ema, parameters.actor, settings.ema_decay, train_state.updates),
         optimiser=optimiser,
-        episodes=episodes,
-        key=key,
+        episodes=jax.tree.map(lambda *leaves: jnp.concatenate(leaves, axis=-1), *episodes),
+        key=jax.random.fold_in(train_state.key, len(parts)),
         updates=train_state.updates + 1,
     )
-    spread = jnp.var(flat.target)
-    explained = 1 - jnp.var(flat.advantage) / jnp.where(spread > 0, spread, 1.0)
-    return after, {**seen, **losses, "std": jnp.mean(jnp.exp(parameters.log_std)), "explained_variance": explained}
+    variance = jnp.var(batch.target)
+    explained = 1 - jnp.var(batch.advantage) / jnp.where(variance > 0, variance, 1.0)
+    metrics = {**metrics_of(total), **losses, "explained_variance": explained}
+    return after, {**metrics, "std": jnp.mean(jnp.exp(parameters.log_std))}
+
+
+def _flat(samples: Array) -> Array:
+    """Samples [time, environment, ...] as [time * environment, ...]."""
+    return samples.reshape(-1, *samples.shape[2:])
 
 
 def rollout(
     task: Task, settings: PpoSettings, parameters: Parameters, episodes: Episode, key: Array
 ) -> tuple[Episode, Batch, dict[str, Any]]:
-    """The episodes after `settings.rollout` steps, the samples [time, environment, ...], and their metrics."""
+    """The episodes after `settings.rollout` steps, the samples [time, environment, ...], and their sums."""
     noise_key, action_key, reset_key = jax.random.split(key, 3)
     steps, width = settings.rollout, settings.environments
     noise = jax.random.split(noise_key, (steps + 1, width))
@@ -124,7 +182,7 @@ def rollout(
         controller=jax.random.normal(action_key, (steps, width, 4)),
         next_noise=noise[1:],  # before a reset: what a truncated episode would have gone on from
     )
-    factor = input_scale(settings.input_scale)
+    factor = network_scale(task, settings.input_scale)
 
     def decide(memory: Any, observation: Array, draw: Array, episodes: Episode) -> Any:
         seen = observation * factor
@@ -132,12 +190,13 @@ def rollout(
         action = mean + jnp.exp(parameters.log_std) * draw
         return memory, action, (seen, mean, action)
 
-    (episodes, _), step = simulate(
-        task, decide, (episodes, ()), draws, record=lambda task, after, moved, outcome: (outcome, moved)
-    )
-    (seen, mean, action), following, (outcome, moved) = step.notes, step.following * factor, step.record
+    def record(task: Task, after: Episode, moved: Episode, outcome: Outcome) -> Any:
+        return outcome, moved.reward, moved.steps
+
+    (episodes, _), step = simulate(task, decide, (episodes, ()), draws, record=record)
+    (seen, mean, action), following, (outcome, rewards, lengths) = step.notes, step.following * factor, step.record
     value, next_value = (
-        _outputs(parameters.critic, each.reshape(-1, SIZE)).reshape(steps, width) for each in (seen, following)
+        _outputs(parameters.critic, each.reshape(-1, task.inputs)).reshape(steps, width) for each in (seen, following)
     )
     advantage = advantages(
         outcome.reward,
@@ -155,7 +214,7 @@ def rollout(
         advantage=advantage,
         target=advantage + value,
     )
-    return episodes, batch, rollout_metrics(task, outcome, moved.reward, moved.steps)
+    return episodes, batch, rollout_sums(task, outcome, rewards, lengths)
 
 
 def _outputs(network: Network, inputs: Float[Array, "batch inputs"]) -> Float[Array, "batch outputs"]:
@@ -191,19 +250,26 @@ def advantages(
     return jax.lax.scan(back, jnp.zeros_like(delta[0]), (delta, ended), reverse=True)[1]
 
 
-def log_probability(
-    mean: Float[Array, "*batch 4"], log_std: Float[Array, "4"], action: Float[Array, "*batch 4"]
-) -> Float[Array, "*batch"]:
-    """The log density of actions under a diagonal Gaussian."""
-    squared = ((action - mean) * jnp.exp(-log_std)) ** 2
-    return -0.5 * jnp.sum(squared, axis=-1) - jnp.sum(log_std) - 0.5 * 4 * math.log(2 * math.pi)
-
-
 def learn(
-    settings: PpoSettings, parameters: Parameters, optimiser: Any, batch: Batch, key: Array
+    settings: PpoSettings, parameters: Parameters, optimiser: Any, batch: Batch, key: Array, threads: Any = 1
 ) -> tuple[Parameters, Any, dict[str, Array]]:
     """Parameters and optimiser after all epochs over the samples [S, ...], and the mean losses of the last epoch."""
-    samples = batch.action.shape[0]
+    shuffled = orders(jax.random.split(key, settings.epochs), batch.action.shape[0])
+    return learn_in_order(settings, parameters, optimiser, batch, shuffled, threads)
+
+
+def orders(keys: Array, samples: int) -> UInt32[Array, "epochs samples"]:
+    """The order of the samples in each epoch, one epoch per key."""
+    return jax.lax.map(lambda key: shuffle(key, samples), keys)
+
+
+def learn_in_order(
+    settings: PpoSettings, parameters: Parameters, optimiser: Any, batch: Batch, orders: Array, threads: Any
+) -> tuple[Parameters, Any, dict[str, Array]]:
+    """The same with the samples in a given order [epochs, S]: one kernel in up to two threads where kernels run."""
+    if available():
+        orders = orders.reshape(-1, settings.minibatch)
+        return learn_in_threads(settings, parameters, optimiser, batch, orders, threads)
     # one vector, so that clipping and Adam are a few long loops and not many short ones
     flat, restore = ravel_pytree(parameters)
     method = _optimiser(settings, parameters)
@@ -217,24 +283,23 @@ def learn(
         axis=-1,
     )
 
-    def epoch(carry: Any, key: Array) -> Any:
-        shuffled = columns[shuffle(key, samples)].reshape(-1, settings.minibatch, columns.shape[-1])
+    def epoch(carry: Any, order: Array) -> Any:
+        shuffled = columns[order].reshape(-1, settings.minibatch, columns.shape[-1])
         return jax.lax.scan(minibatch, carry, jnp.swapaxes(shuffled, 1, 2))
 
     def minibatch(carry: Any, rows: Array) -> Any:
         flat, optimiser = carry
         part = Batch(
-            observation=rows[:SIZE].T,
-            action=rows[SIZE : SIZE + 4].T,
-            log_probability=rows[SIZE + 4],
-            advantage=rows[SIZE + 5],
-            target=rows[SIZE + 6],
+            observation=rows[:-7].T,
+            action=rows[-7:-3].T,
+            log_probability=rows[-3],
+            advantage=rows[-2],
+            target=rows[-1],
         )
         gradient, losses = jax.grad(lambda flat: loss(settings, restore(flat), part), has_aux=True)(flat)
         return descend(method, gradient, optimiser, flat), losses
 
-    keys = jax.random.split(key, settings.epochs)
-    (flat, optimiser), losses = jax.lax.scan(epoch, (flat, optimiser), keys)
+    (flat, optimiser), losses = jax.lax.scan(epoch, (flat, optimiser), orders)
     return restore(flat), optimiser, {name: jnp.mean(values[-1]) for name, values in losses.items()}
 
 
@@ -255,33 +320,25 @@ def shuffle(key: Array, number: int) -> Array:
 
 def loss(settings: PpoSettings, parameters: Parameters, batch: Batch) -> tuple[Array, dict[str, Array]]:
     """The clipped surrogate, value and entropy loss of one minibatch, and its parts. Source: Schulman et al. 2017."""
-    advantage = batch.advantage
-    advantage = (advantage - jnp.mean(advantage)) / (jnp.std(advantage, ddof=1) + 1e-8)
+    advantage = (batch.advantage - jnp.mean(batch.advantage)) / spread(batch.advantage)
     logarithm = log_probability(_outputs(parameters.actor, batch.observation), parameters.log_std, batch.action)
-    ratio = jnp.exp(logarithm - batch.log_probability)
-    clipped = jnp.clip(ratio, 1 - settings.clip_range, 1 + settings.clip_range)
-    policy_loss = -jnp.mean(jnp.minimum(ratio * advantage, clipped * advantage))
+    losses, beyond, divergence = surrogate(settings, logarithm, batch.log_probability, advantage)
+    policy_loss = jnp.mean(losses)
     value_loss = jnp.mean((_outputs(parameters.critic, batch.observation)[:, 0] - batch.target) ** 2)
-    entropy = jnp.sum(parameters.log_std) + 0.5 * 4 * math.log(2 * math.pi * math.e)
-    total = policy_loss + settings.value_weight * value_loss - settings.entropy_weight * entropy
+    total = policy_loss + settings.value_weight * value_loss - settings.entropy_weight * entropy(parameters.log_std)
     parts = {
         "loss": total,
         "policy_loss": policy_loss,
         "value_loss": value_loss,
-        "clip_fraction": jnp.mean(jnp.abs(ratio - 1) > settings.clip_range),
-        "approximate_kl": jnp.mean(ratio - 1 - (logarithm - batch.log_probability)),
+        "clip_fraction": jnp.mean(beyond),
+        "approximate_kl": jnp.mean(divergence),
     }
     return total, parts
 
 
 def _optimiser(settings: PpoSettings, parameters: Parameters) -> optax.GradientTransformation:
     """What makes a step of a gradient, both as one vector."""
-    rate: Any = settings.learning_rate
-    if settings.final_learning_rate < 1:
-        minibatches = settings.environments * settings.rollout // settings.minibatch
-        total = settings.updates * settings.epochs * minibatches
-        rate = optax.linear_schedule(rate, rate * settings.final_learning_rate, total)
-    return optax.chain(_clipping(settings, parameters), optax.adam(rate, eps=1e-5))
+    return optax.chain(_clipping(settings, parameters), optax.adam(learning_rate(settings), B1, B2, EPS))
 
 
 def _clipping(settings: PpoSettings, parameters: Parameters) -> optax.GradientTransformation:

@@ -157,6 +157,7 @@ TRAINERS = {
             summary="proximal policy optimisation, the algorithm of the paper",
             module="flytune.training.ppo",
             settings_field="ppo",
+            supports_dials=True,
         ),
         Trainer(
             name="sb3",
