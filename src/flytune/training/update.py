@@ -84,7 +84,7 @@ class BusyCores:
     after some updates.
     """
 
-    FREE, PAUSE = 1.75, 15  # seconds of processor per second that show free cores; updates in one thread after fewer
+    FREE, PAUSE = 1.6, 15  # seconds of processor per second that show free cores; updates in one thread after fewer
 
     def __init__(self) -> None:
         self._pause = 0
