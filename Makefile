@@ -1,4 +1,4 @@
-# make demo    train the baseline controller, fly 100 trials, write report.html
+# make demo    three responses of one policy (three-responses.html); then train a controller, write report.html
 # make test    the test suite        make test-slow   the trainings it leaves out
 # make test-sb3  the tests that need PyTorch (a large download)
 # make test-busy  the test suite while every core is kept busy: no test may depend on the speed of the machine
@@ -14,9 +14,11 @@ export PIP_DISABLE_PIP_VERSION_CHECK = 1
 .PHONY: demo test test-busy test-slow test-sb3 check docs pins clean
 
 demo: .venv/base.stamp
+	@$(BIN)/flytune report dial@settling_time=2.5 dial@settling_time=5 dial@settling_time=10 --duration 20 \
+		--out three-responses.html
 	@run=$$($(BIN)/flytune train baseline | tail -n 1) && \
 	$(BIN)/flytune report "$$run" --out report.html && \
-	echo "open report.html in a browser"
+	echo "open three-responses.html and report.html in a browser"
 
 test: .venv/dev.stamp
 	$(PYTEST) -m "not slow"
@@ -72,4 +74,4 @@ pins:
 		sha256sum "$$file" | sed -E 's/ .*//; s/^/    --hash=sha256:/'; done > ../../requirements/sb3.txt
 
 clean:
-	rm -rf .venv .jax_cache build runs report.html
+	rm -rf .venv .jax_cache build runs report.html three-responses.html

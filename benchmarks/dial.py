@@ -4,6 +4,7 @@
     python benchmarks/dial.py turns [CONTROLLER]  1,000 flights in which the dial is turned at random times
     python benchmarks/dial.py wishes              `flytune tune` for 30 settling times, in a process each
     python benchmarks/dial.py price               the policy with a dial beside the policies for one response
+    python benchmarks/dial.py picture FILE.png    three wishes and three responses, and the map
 
 RUN and CONTROLLER are what `flytune evaluate` takes; without it, the policy that ships.
 """
@@ -20,9 +21,10 @@ os.environ.setdefault("XLA_FLAGS", "--xla_cpu_multi_thread_eigen=false intra_op_
 import numpy as np
 
 from flytune import find_controller, fly, judge, load_task
+from flytune.control.response_map import response_map
 from flytune.control.schedule import with_schedule
 from flytune.evaluation.judge import AXES
-from flytune.evaluation.statistics import quantile
+from flytune.evaluation.statistics import bootstrap_interval, quantile
 
 SETTINGS, TRIALS = 20, 100
 SCHEDULES, FLIGHTS, TURNS, DURATION = 50, 20, (2, 7), 20.0  # 1,000 flights of 20 s with 2 to 6 turns each
@@ -168,11 +170,61 @@ def price():
             )
 
 
+def picture(path):
+    """Three wishes, their responses, and the wished against the measured settling time."""
+    import matplotlib
+
+    matplotlib.use("agg")
+    from matplotlib import pyplot
+
+    found, colours = find_controller("dial"), ("#c2571a", "#2a7f9e", "#5a4a9c")
+    figure, (left, right) = pyplot.subplots(1, 2, figsize=(11, 4), dpi=110, width_ratios=(1.6, 1))
+    for wish, colour in zip((2.5, 5.0, 10.0), colours, strict=True):
+        setting = found.with_dial({"settling_time": wish}).controller
+        flights = fly(setting, found.task, trials=TRIALS, seed=1, duration=20.0)
+        distance = np.linalg.norm(flights.position - flights.target_position, axis=-1)
+        left.plot(flights.time, distance[:25].T, color=colour, linewidth=0.5, alpha=0.5)
+        took = quantile(judge(flights).settling_time["position"], 0.5)
+        left.axvline(
+            took, color=colour, linewidth=1.5, linestyle="--", label=f"asked {wish:g} s, measured {took:.2f} s"
+        )
+    left.set(xlabel="time [s]", ylabel="distance to the target [m]", xlim=(0, 16), ylim=(0, None))
+    left.set_title("One policy, three settings of its dial, 25 flights each", fontsize=10)
+    left.legend(title="settling time, median", fontsize=8, title_fontsize=8)
+    known = response_map(found.controller)
+    fastest, slowest = known.range()
+    for wish in np.geomspace(fastest, slowest, 15):
+        setting = found.with_dial({"settling_time": float(wish)}).controller
+        times = judge(fly(setting, found.task, trials=TRIALS, seed=7, duration=25.0)).settling_time["position"]
+        low, high = bootstrap_interval([times], number=500)
+        right.plot([wish, wish], [low, high], color="#2a7f9e", linewidth=1)
+        right.plot(wish, quantile(times, 0.5), "o", color="#2a7f9e", markersize=4)
+    right.plot([fastest, slowest], [fastest, slowest], color="0.6", linewidth=0.8, zorder=0)
+    for name in SINGLE:
+        task = load_task(name)
+        times = judge(fly(find_controller(name).controller, task, trials=TRIALS, seed=7, duration=25.0)).settling_time
+        took = quantile(times["position"], 0.5)
+        right.plot(took, took, "s", color="#c2571a", markersize=6, markerfacecolor="none")
+        right.annotate(
+            name.removesuffix("-refined"), (took, took), xytext=(6, -10), textcoords="offset points", fontsize=8
+        )
+    right.set(xscale="log", yscale="log", xlabel="settling time asked for [s]", ylabel="measured, median [s]")
+    ticks = [2, 3, 4, 6, 8, 10]
+    for axis in (right.xaxis, right.yaxis):
+        axis.set_ticks(ticks, [str(tick) for tick in ticks])
+        axis.set_ticks([], minor=True)
+    right.set_title("Squares: policies trained for one response", fontsize=10)
+    for axes in (left, right):
+        axes.spines[["top", "right"]].set_visible(False)
+    figure.tight_layout()
+    figure.savefig(path)
+
+
 if __name__ == "__main__":
-    if len(sys.argv) < 2 or sys.argv[1] not in ("map", "turns", "wishes", "price"):
+    if len(sys.argv) < 2 or sys.argv[1] not in ("map", "turns", "wishes", "price", "picture"):
         sys.exit(__doc__)
     command, arguments = sys.argv[1], sys.argv[2:]
     if command == "map":
         measure_map(arguments or ["dial"])
     else:
-        {"turns": turns, "wishes": wishes, "price": price}[command](*arguments)
+        {"turns": turns, "wishes": wishes, "price": price, "picture": picture}[command](*arguments)

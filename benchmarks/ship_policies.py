@@ -3,8 +3,9 @@
     flytune reproduce --refined --trainer apg --out refined-apg
     flytune reproduce --refined --trainer ppo --out refined-ppo
     python benchmarks/ship_policies.py refined-apg refined-ppo
+    python benchmarks/ship_policies.py --run runs/dial-apg-s0
 
-The best seed has the most feasible trials settled on all axes; among equals, the smallest median
+Of a study, the best seed has the most feasible trials settled on all axes; among equals, the smallest median
 position error. The script flies the averaged policy, on trials that neither training nor `evaluate` uses.
 """
 
@@ -40,22 +41,30 @@ def ship(folder: Path, commit: str | None) -> None:
         trainings = [training for training in study.trainings() if training.behaviour == behaviour]
         ranked = sorted(trainings, key=lambda training: quality(training.directory, study, behaviour), reverse=True)
         best = ranked[0]
-        stem = f"{best.preset}@{study.trainer}"
-        target = Path(str(HOME))
-        target.mkdir(exist_ok=True)
-        shutil.copyfile(best.directory / "policy.safetensors", target / f"{stem}.safetensors")
-        facts = read_facts(best.directory)
-        # the study's own command names a task file; this command gives the same policy bit by bit
-        facts["command"] = f"flytune train {best.preset} --trainer {study.trainer} --seed {best.seed}".split()
-        facts["commit"] = facts["commit"] or commit
-        (target / f"{stem}.json").write_text(json.dumps(facts, indent=2) + "\n", encoding="utf-8")
-        print(f"{stem}: seed {best.seed}, {quality(best.directory, study, behaviour)}")
+        ship_run(best.directory, best.preset, study.trainer, best.seed, commit)
+        print(f"{best.preset}@{study.trainer}: seed {best.seed}, {quality(best.directory, study, behaviour)}")
+
+
+def ship_run(directory: Path, preset: str, trainer: str, seed: int, commit: str | None) -> None:
+    """Copy the policy of one run."""
+    stem, target = f"{preset}@{trainer}", Path(str(HOME))
+    target.mkdir(exist_ok=True)
+    shutil.copyfile(directory / "policy.safetensors", target / f"{stem}.safetensors")
+    facts = read_facts(directory)
+    # the command of a study names a task file; this command gives the same policy bit by bit
+    facts["command"] = f"flytune train {preset} --trainer {trainer} --seed {seed}".split()
+    facts["commit"] = facts["commit"] or commit
+    (target / f"{stem}.json").write_text(json.dumps(facts, indent=2) + "\n", encoding="utf-8")
 
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("studies", nargs="+", type=Path)
+    parser.add_argument("studies", nargs="*", type=Path)
+    parser.add_argument("--run", type=Path, help="the run directory of one policy")
     parser.add_argument("--commit", help="of the code, where the studies did not run from a checkout")
     options = parser.parse_args()
     for study_folder in options.studies:
         ship(study_folder, options.commit)
+    if options.run:
+        run = read_facts(options.run)
+        ship_run(options.run, run["task"], run["trainer"], run["seed"], options.commit)
