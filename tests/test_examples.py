@@ -18,6 +18,7 @@ SMALL = {
     "own_simulator": ("--trials", "4"),
     "train_and_judge": ("--updates", "2", "--trials", "4"),
     "tune_to_a_response": ("--settling-time", "3"),
+    "turn_a_dial": ("--trials", "4"),
     "write_a_report": ("--trials", "4"),
 }
 NEEDS = {"export_to_onnx": "onnxruntime", "gymnasium_loop": "gymnasium", "other_simulator": "pybullet"}
@@ -32,6 +33,7 @@ SHOWS = {
     "own_simulator": "PushedSimulator: settled",
     "train_and_judge": "crashed",
     "tune_to_a_response": "\nmet\n",
+    "turn_a_dial": "for a settling time of 4 s: dial at 0.5",
     "write_a_report": "open report.html in a browser",
 }
 

@@ -5,6 +5,8 @@ from .control.classical import classical_controller as classical_controller
 from .control.policy import Policy as Policy
 from .control.policy import load_policy as load_policy
 from .control.policy import save_policy as save_policy
+from .control.response_map import ResponseMap as ResponseMap
+from .control.response_map import response_map as response_map
 from .errors import BadInput as BadInput
 from .errors import Diverged as Diverged
 from .errors import FlytuneError as FlytuneError
@@ -19,6 +21,7 @@ from .evaluation.flights import Flights as Flights
 from .evaluation.fly import fly as fly
 from .evaluation.judge import Judgement as Judgement
 from .evaluation.judge import judge as judge
+from .evaluation.measure_map import measure_map as measure_map
 from .export import export_policy as export_policy
 from .export.onnx import save_onnx as save_onnx
 from .export.untrusted.onnx_controller import load_onnx as load_onnx

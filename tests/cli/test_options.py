@@ -12,9 +12,12 @@ from flytune.cli.main import main, make_app
 
 OPTIONS = {
     "train": "TASK --trainer --seed --steps --out --set --resume --tensorboard",
-    "evaluate": "CONTROLLER --task --world --world-set --trials --seed --duration --starts --json --out --flights",
-    "compare": "CONTROLLER --task --world --world-set --trials --seed --duration --starts --json --out --flights",
-    "report": "CONTROLLER --task --world --world-set --trials --seed --duration --starts --out",
+    "evaluate": "CONTROLLER --task --world --world-set --trials --seed --duration --starts --dial --json --out "
+    "--flights",
+    "compare": "CONTROLLER --task --world --world-set --trials --seed --duration --starts --dial --json --out "
+    "--flights",
+    "report": "CONTROLLER --task --world --world-set --trials --seed --duration --starts --dial --out",
+    "map": "CONTROLLER --dial --measure --json",
     "tune": "TASK --settling-time --at-most --tolerance --overshoot --error --axis --percentile --set --rules "
     "--trainer "
     "--iterations --seed --out --resume",

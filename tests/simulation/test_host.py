@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from flytune.errors import BadInput
 from flytune.simulation import environment
 from flytune.simulation.host import HostEnvironment, unravel
 from flytune.simulation.jax_simulator import JaxSimulator
@@ -170,3 +171,10 @@ def test_a_simulator_on_the_host_brings_the_same_as_one_on_the_device():
         np.testing.assert_array_equal(other.ended, one_way.ended)
         ends += int(one_way.ended.sum())
     assert ends > NUMBER  # new episodes are placed in the simulator, too
+
+
+def test_a_task_with_a_dial_is_refused_and_at_one_setting_it_is_not():
+    family = load_task("dial")
+    with pytest.raises(BadInput, match="task: dial has a dial"):
+        make(family)
+    assert make(family.at({"speed": 0.3})).observation.shape == (NUMBER, 17)

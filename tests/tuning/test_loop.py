@@ -20,18 +20,21 @@ RULES = load_rules()
 
 
 def test_a_requirement_that_a_known_policy_meets_needs_no_training(tmp_path):
-    measured = judge(fly(*_known("baseline-refined"), trials=100, seed=3000)).to_dict()
-    time = measured["position"]["settling_time"]["median"]
     said = []
-    result = tune(time, out=tmp_path / "t", on_message=said.append)
+    result = tune(3.3, out=tmp_path / "t", on_message=said.append)
     assert result.met
     assert result.best == 0
-    assert result.start == "baseline-refined"
+    assert result.start == "dial"
+    assert "no training was needed" in said[2]
     assert [line.split()[0] for line in said] == [
         "requirement", "training", "start", "iteration", "validation", "result",
     ]  # fmt: skip
     controller = find_controller(str(tmp_path / "t"))
     assert judge(fly(controller.controller, controller.task, seed=7)).settled("position") == 100
+    # it is an ordinary policy and an ordinary task: what reads them need not know of the dial
+    assert load_policy(tmp_path / "t" / "policy.safetensors").actor.sizes == (17, 64, 64, 4)
+    assert not load_task(tmp_path / "t" / "task.toml").dial
+    assert find_controller(str(tmp_path / "t" / "policy.safetensors")).task.speed_bound == controller.task.speed_bound
 
 
 def test_a_requirement_that_no_controller_can_meet_is_refused_before_anything_is_written(tmp_path):
@@ -128,9 +131,9 @@ def test_an_iteration_that_diverges_is_not_edited_further(tmp_path):
 def test_a_tuning_that_ended_without_success_stays_as_it_is_when_resumed(tmp_path):
     rules = [rule for rule in RULES if rule.name == "H6 faster"]
     fixed = {"apg.updates": 1}
-    first = tune(2.0, rules=rules, out=tmp_path / "t", edits=fixed, most_iterations=2)
+    first = tune(1.5, rules=rules, out=tmp_path / "t", edits=fixed, most_iterations=2)
     assert not first.met
-    again = tune(2.0, rules=rules, out=tmp_path / "t", edits=fixed, most_iterations=2, resume=True)
+    again = tune(1.5, rules=rules, out=tmp_path / "t", edits=fixed, most_iterations=2, resume=True)
     assert (again.iterations, again.validations, again.best) == (first.iterations, first.validations, first.best)
 
 

@@ -9,7 +9,6 @@ import math
 from collections.abc import Callable, Mapping
 from typing import Any, TypeVar
 
-import jax
 from pydantic_core import core_schema
 
 T = TypeVar("T")
@@ -19,7 +18,6 @@ FUNCTIONS = {"min": 2, "max": 2, "exp": 1, "log": 1, "sqrt": 1}  # name -> numbe
 ALLOWED = f"numbers, names of dials, + - * / **, {', '.join(FUNCTIONS)} and parentheses"
 
 
-@jax.tree_util.register_static
 class Formula(str):
     """The text of a formula; part of the structure of a task, so that another formula compiles another program."""
 

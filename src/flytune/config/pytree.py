@@ -6,7 +6,10 @@ from typing import Any, TypeVar, dataclass_transform
 import jax
 from pydantic import ConfigDict
 
+from flytune.config.formula import Formula
+
 T = TypeVar("T")
+jax.tree_util.register_static(Formula)
 
 
 def static(**options: Any) -> Any:

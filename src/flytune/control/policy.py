@@ -114,16 +114,15 @@ class Policy:
         """
         first, *others = self.actor.weights
         bias, *biases = self.actor.biases
-        weight, place = first[:SIZE], SIZE
+        weight, bias, further = np.array(first[:SIZE]), np.array(bias), np.asarray(first[SIZE:])
         for name in sorted(self.inputs):
             each = self.inputs[name]
-            value, mine = each.value.value(self.setting), first[place : place + each.size]
-            place += each.size
+            value, (mine, further) = float(each.value.value(self.setting)), np.split(further, [each.size])
             if (rows := each.rows()) is None:
-                bias = bias + value * mine[0]
+                bias += value * mine[0]
             else:
-                weight = weight.at[rows].add(value * mine / self.input_scale[rows, None])
-        actor = Network(weights=(weight, *others), biases=(bias, *biases))
+                weight[rows] += value * mine / np.asarray(self.input_scale)[rows, None]
+        actor = Network(weights=(jnp.asarray(weight), *others), biases=(jnp.asarray(bias), *biases))
         return dataclasses.replace(self, actor=actor, dials={}, inputs={}, setting={}, maps={})
 
     def initial_memory(self) -> tuple[()]:

@@ -98,9 +98,11 @@ class ResponseMap:
         """
         try:
             found = cls(**data)
-            found._curve()
+            found.table()
+            if any(time is not None for time in found.monotone):
+                np.log(np.asarray([time for time in found.monotone if time is not None], float))
             return found
-        except (TypeError, ValueError, AttributeError):
+        except (TypeError, ValueError, AttributeError, KeyError):
             raise BadInput("map: the response map of the policy is damaged. Measure it again: `flytune map`.") from None
 
 

@@ -95,14 +95,14 @@ def fly(
         made.close()
     states, actions = np.asarray(record.states), np.asarray(record.actions)
     turned = _turned(controller, family, steps)
-    margins = _margins_along(family, turned, states, actions) if turned else _margins(task, states, actions)
+    margins = _margins_along(family if turned else task, turned, states, actions)
     trajectories = VehicleStates.from_rows(np.ascontiguousarray(states.transpose(2, 0, 1)))
     return Flights(
         time=np.arange(steps + 1) * CONTROL_PERIOD,
         **{field: getattr(trajectories, field) for field in WIDTHS},
         action=np.ascontiguousarray(actions.transpose(2, 0, 1)),
         crashed=np.asarray(record.crashed),
-        margins={name: np.asarray(margin) for name, margin in margins.items()},
+        margins=margins,
         target_position=np.asarray(task.target.position),
         target_yaw=float(task.target.yaw),
         speed_bound=_largest_speed_bound(family, turned) if turned else task.speed_bound,
@@ -332,28 +332,32 @@ def _decide(controller: Any, memory: Any, seen: jax.Array) -> tuple[Any, jax.Arr
     return memory, jnp.clip(given, -1.0, 1.0), given, finite
 
 
-@program()
-def _margins(task: Task, states: jax.Array, actions: jax.Array) -> dict[str, jax.Array]:
-    """The margins [N, T + 1] of states [T + 1, 17, N] under actions [T + 1, 4, N]."""
-
-    def one(numbers: jax.Array, actions: jax.Array) -> dict[str, jax.Array]:
-        none_pending = jnp.zeros((len(actions), task.vehicle.action_latency_steps, 4))
-        return margins_along(task, state_from(numbers.T, none_pending), actions)
-
-    return jax.vmap(one, in_axes=-1)(states, actions)
-
-
-@program()
 def _margins_along(
-    task: Task, settings: dict[str, jax.Array], states: jax.Array, actions: jax.Array
-) -> dict[str, jax.Array]:
-    """The margins [N, T + 1] where the dials of the task have the settings [T + 1]."""
+    task: Task, settings: dict[str, np.ndarray], states: np.ndarray, actions: np.ndarray
+) -> dict[str, np.ndarray]:
+    """The margins [N, T + 1] of states [T + 1, 17, N] under actions [T + 1, 4, N].
 
-    def one(numbers: jax.Array, actions: jax.Array) -> dict[str, jax.Array]:
-        none_pending = jnp.zeros((len(actions), task.vehicle.action_latency_steps, 4))
-        return margins_along(task, state_from(numbers.T, none_pending), actions, settings)
+    Where the dials of the task are turned in flight, `settings` has their value at each sample, [T + 1]; else it is
+    empty. One compiled program computes `CHUNK` samples at a time, whatever the duration.
+    """
+    changes, samples = np.diff(actions, axis=0, prepend=np.zeros_like(actions[:1])), len(states)
+    parts = []
+    for first in range(0, samples, CHUNK):
+        rows = np.minimum(np.arange(first, first + CHUNK), samples - 1)
+        here = {name: np.asarray(values[rows], np.float32) for name, values in settings.items()}
+        parts.append(_margins(task, here, states[rows], changes[rows]))
+    return {name: np.concatenate([np.asarray(part[name]) for part in parts], axis=-1)[:, :samples] for name in parts[0]}
 
-    return jax.vmap(one, in_axes=-1)(states, actions)
+
+@program()
+def _margins(task: Task, settings: dict[str, jax.Array], states: jax.Array, changes: jax.Array) -> dict[str, jax.Array]:
+    """The margins [N, samples] of states [samples, 17, N] under changes of the action [samples, 4, N]."""
+
+    def one(numbers: jax.Array, changes: jax.Array) -> dict[str, jax.Array]:
+        none_pending = jnp.zeros((len(changes), task.vehicle.action_latency_steps, 4))
+        return margins_along(task, settings, state_from(numbers.T, none_pending), changes)
+
+    return jax.vmap(one, in_axes=-1)(states, changes)
 
 
 def _not_finite(name: str, action: Any, trial: int | np.integer, step: int | np.integer) -> Diverged:

@@ -152,9 +152,10 @@ def _settled_dot(flights: Flights, judgement: Judgement, values: np.ndarray, tri
 
 def target_and_band(figure: go.Figure, row: int, column: int, target: float, band: float) -> None:
     """Draw the target and the settling band behind the curves of a panel."""
-    place = style.at(row, column)
-    figure.add_hrect(target - band, target + band, fillcolor=style.BAND, line_width=0, layer="below", **place)
-    figure.add_hline(target, line={"color": style.QUIET, "width": 1, "dash": "dash"}, layer="below", **place)
+    # plotly's add_hrect and add_hline draw the same, thirty times slower
+    wide = {"x0": 0, "x1": 1, "xref": "x domain", "layer": "below", **style.at(row, column)}
+    figure.add_shape(type="rect", y0=target - band, y1=target + band, fillcolor=style.BAND, line={"width": 0}, **wide)
+    figure.add_shape(type="line", y0=target, y1=target, line={"color": style.QUIET, "width": 1, "dash": "dash"}, **wide)
 
 
 def spread(judgement: Judgement) -> go.Figure | str:

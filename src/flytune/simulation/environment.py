@@ -150,20 +150,19 @@ def is_crashed(task: Task, state: State) -> Bool[Array, ""]:
 
 
 def margins_along(
-    task: Task, states: State, actions: Float[Array, "T 4"], settings: Any = None
+    task: Task, settings: Any, states: State, changes: Float[Array, "T 4"]
 ) -> dict[str, Float[Array, "T"]]:
-    """The margins of each termination along one trial, first axis time; `states` [T, ...] likewise.
+    """The margins of each termination along one trial, first axis time.
 
     Args:
         task: the task, or where its dials are turned in flight the family.
+        settings: of the dials, each [T]; empty for a task without dials.
         states: the states [T, ...].
-        actions: the action before each state.
-        settings: of the dials, each [T]; None for a task without dials.
+        changes: of the action before each state.
     """
-    changes = jnp.diff(actions, axis=0, prepend=jnp.zeros_like(actions[:1]))
 
-    def one(state: State, change: Array, numbers: Any) -> dict[str, Array]:
-        here = task if numbers is None else task.member(numbers)
+    def one(numbers: Any, state: State, change: Array) -> dict[str, Array]:
+        here = task.member(numbers)
         return margins(here.termination, situation(here.target, state, change))
 
-    return jax.vmap(one)(states, changes, settings)
+    return jax.vmap(one)(settings, states, changes)

@@ -16,6 +16,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
+from flytune.errors import BadInput
 from flytune.kernels.batched import batched
 from flytune.physics.dynamics import hovering
 from flytune.simulation import environment
@@ -106,9 +107,17 @@ class HostEnvironment:
         simulator: of N vehicles.
         number: N.
         ending: what follows the end of an episode, one of `ENDINGS`.
+
+    Raises:
+        BadInput: a task with dials, whose settings this rollout does not draw.
     """
 
     def __init__(self, task: Task, simulator: Simulator, number: int, ending: str = "restart") -> None:
+        if task.dial:
+            raise BadInput(
+                f"task: {task.name} has a dial, which one environment cannot turn. Allowed: the task at one setting, "
+                "load_task(...).at({'NAME': value})."
+            )
         self.task, self.number, self.simulator = task, number, simulator
         leaves, self._structure = jax.tree.flatten(task)
         self._numbers = jnp.asarray(np.asarray(leaves, np.float32))

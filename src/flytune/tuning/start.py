@@ -52,20 +52,20 @@ def find_start(requirement: Requirement, wanted: str | None, edits: Mapping[str,
     Raises:
         BadInput: no such task, a bad edit, or a requirement that no controller can meet.
     """
-    tasks = {wanted: load_task(wanted, dict(edits))} if wanted else _known_tasks(edits)
-    first = next(iter(tasks.values()))
-    flights = fly(HoverThrust(), first, trials=TRAINING_TRIALS, seed=TRAINING_SEED, duration=0.6)
-    check_feasible(first, requirement, flights, tuple(edits))
+    dialled = find_setting(requirement, edits, trainer) if not wanted else None
+    tasks: dict[str, Task] = {}
+    times: dict[str, float] = {}
+    if dialled is not None:
+        tasks[DIAL], times[DIAL] = dialled.task, _time(dialled.response)
+    if dialled is None or requirement.misses(dialled.response):  # else it is possible, and no other has to be flown
+        known_tasks = {wanted: load_task(wanted, dict(edits))} if wanted else _known_tasks(edits)
+        first = next(iter(known_tasks.values()))
+        flights = fly(HoverThrust(), first, trials=TRAINING_TRIALS, seed=TRAINING_SEED, duration=0.6)
+        check_feasible(first, requirement, flights, tuple(edits))
+        tasks |= known_tasks
     name = WITHOUT_POLICY if WITHOUT_POLICY in tasks else next(iter(tasks))
     policy = record = judgement = None
-    times: dict[str, float] = {}
     smallest = math.inf
-    dialled = find_setting(requirement, edits, trainer) if not wanted else None
-    if dialled is not None:
-        tasks[DIAL] = dialled.task
-        times[DIAL] = _time(dialled.response)
-        if not requirement.tightened().misses(dialled.response):
-            tasks = {DIAL: dialled.task}  # no other policy has to be flown
     for known, task in tasks.items():
         if known == DIAL and dialled is not None:
             found, judged = (dialled.policy, dialled.record), dialled.judgement

@@ -9,7 +9,7 @@ from typing import Any
 from flytune.errors import BadInput, Interrupted
 from flytune.report.tuning import write_tuning
 from flytune.runs.directory import new_directory
-from flytune.training.loop import Progress
+from flytune.training.progress import Progress
 from flytune.training.trainer import DEFAULT_TRAINER, find_trainer
 from flytune.tuning.loop import Tuner
 from flytune.tuning.messages import line
