@@ -97,8 +97,16 @@ def test_a_schedule_sets_the_dial_from_the_step_of_each_time_on():
         expected = policy().at(speed=speed, calm=1.0)(OBSERVATIONS[0])
         for step in steps:
             np.testing.assert_allclose(actions[step], expected, atol=1e-6)
-    assert [step for step, _ in turned.settings()] == [0, 5, 10]
-    assert turned.settings()[1][1] == pytest.approx({"speed": 1.0, "calm": 1.0})
+    settings = turned.settings(12)
+    assert settings["speed"] == pytest.approx([*[0.3] * 5, *[1.0] * 5, 0.2, 0.2])
+    assert settings["calm"] == pytest.approx([1.0] * 12)
+
+
+def test_a_dial_with_a_sweep_time_moves_at_its_pace_and_stops_where_it_was_turned_to():
+    slow = dataclasses.replace(policy(), dials={"speed": SPEED, "calm": dataclasses.replace(CALM, sweep_time=0.1)})
+    turned = with_schedule(slow, {"calm": [[0, 0.0], [0.02, 0.35]]})
+    # a range of 1 in 10 steps: a tenth per step
+    assert turned.settings(8)["calm"] == pytest.approx([0, 0, 0.1, 0.2, 0.3, 0.35, 0.35, 0.35])
 
 
 def test_a_constant_schedule_is_a_setting():

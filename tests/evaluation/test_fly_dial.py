@@ -82,3 +82,17 @@ def test_a_controller_without_a_dial_refuses_a_setting():
         evaluate("lqr", dial={"speed": 0.3})
     with pytest.raises(BadInput, match="baseline-refined: has no dial"):
         find_controller("baseline-refined@speed=0.3")
+
+
+def test_a_judgement_says_at_which_setting_it_was_flown(tmp_path):
+    flights = fly(POLICY.at(speed=0.3), FAMILY, trials=2, duration=1.0)
+    judged = judge(flights)
+    assert judged.to_dict()["dial"] == {"speed": 0.3}
+    assert "on dial, speed 0.3 (crazyflie" in judged.table()
+    turned = evaluate("dial", dial={"speed": [[0, 0.3], [0.5, 1.0]]}, trials=2, duration=1.0).judgement
+    assert turned.to_dict()["dial"] == {"speed": [[0.0, 0.3], [0.5, 1.0]]}
+    assert "speed 0.3 from 0 s on, 1 from 0.5 s on (crazyflie" in turned.table()
+    assert evaluate("lqr", trials=2, duration=1.0).judgement.to_dict()["dial"] is None
+    flights.save(tmp_path / "flights.npz")
+    with np.load(tmp_path / "flights.npz") as file:
+        assert str(file["dial"]) == '{"speed": 0.3}'

@@ -35,13 +35,10 @@ def a_map(values, times, settled=None):
 def test_the_map_that_ships_was_measured_with_the_policy_that_ships():
     carried = response_map(the_policy())
     assert carried is not None
-    # every fifth setting, flown again; its settings are the same ones
-    again = measure_map(the_policy(), FAMILY, settings=4, trials=carried.trials)
-    for value, time in zip(again.values, again.settling_time, strict=True):
-        nearest = int(np.argmin(np.abs(np.asarray(carried.values) - value)))
-        if carried.values[nearest] == pytest.approx(value):
-            assert time["median"] == pytest.approx(carried.settling_time[nearest]["median"], rel=0.01)
-    assert carried.settled == [100] * 20
+    again = measure_map(the_policy(), FAMILY, settings=2, trials=carried.trials)  # the two ends, flown again
+    for index, time in zip((0, -1), again.settling_time, strict=True):
+        assert time["median"] == pytest.approx(carried.settling_time[index]["median"], rel=0.01)
+    assert carried.settled == [carried.trials] * 20
     assert [time["low"] <= time["median"] <= time["high"] for time in carried.settling_time] == [True] * 20
 
 

@@ -56,6 +56,16 @@ class ScheduledPolicy:
         """The dials of the policy."""
         return self.policy.dials
 
+    @property
+    def setting(self) -> dict[str, Any]:
+        """The value of each dial; of a dial that is turned, its pairs [time in s, value]."""
+        setting: dict[str, Any] = {name: float(value) for name, value in self.policy.setting.items()}
+        for name, shares in self.shares.items():
+            times = (round(CONTROL_PERIOD * int(step), 6) for step in self.first_steps[name])
+            values = (float(f"{float(self.dials[name].at(share)):.6g}") for share in shares)
+            setting[name] = [list(pair) for pair in zip(times, values, strict=True)]
+        return setting
+
     def initial_memory(self) -> Any:
         """No step yet; all dials at the first value of their schedule."""
         return jnp.zeros((), jnp.int32), {name: shares[0] for name, shares in self.shares.items()}

@@ -2,7 +2,10 @@
 
 import dataclasses
 import io
+import json
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -28,6 +31,7 @@ class Labels:
     simulator: str
     seed: int
     initial_conditions: str  # "clear" or "paper"
+    dial: Mapping[str, Any] = dataclasses.field(default_factory=dict)  # dial -> value, or its pairs [time in s, value]
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -93,5 +97,6 @@ class Flights(Labels):
             world=self.simulator,
             seed=self.seed,
             starts=self.initial_conditions,
+            dial=json.dumps(dict(self.dial)),
         )
         write_bytes(path, content.getvalue(), "flights")

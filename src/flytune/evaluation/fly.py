@@ -112,7 +112,14 @@ def fly(
         simulator=simulator_name,
         seed=seed,
         initial_conditions=initial_conditions,
+        dial=_dial_label(controller),
     )
+
+
+def _dial_label(controller: Any) -> dict[str, Any]:
+    """The setting of a controller's dials in plain numbers, with six digits; empty for one without dials."""
+    setting = getattr(controller, "setting", {}) if getattr(controller, "dials", {}) else {}
+    return {name: value if isinstance(value, list) else float(f"{float(value):.6g}") for name, value in setting.items()}
 
 
 def _setting(controller: Any, task: Task) -> dict[str, float]:

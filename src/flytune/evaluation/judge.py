@@ -112,6 +112,7 @@ class Judgement(Labels):
                 "total_variation": finite(np.mean(self.action_total_variation)),
             },
             "efficiency": {"median": median(self.efficiency)},
+            "dial": dict(self.dial) or None,
         }
 
     def _response(self, channel: str) -> dict:

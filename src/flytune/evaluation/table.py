@@ -46,8 +46,9 @@ def _row(name: str, channel: Mapping[str, Any], trials: int) -> dict[str, Any]:
 
 def response_text(judged: Mapping[str, Any]) -> str:
     """One judgement for a terminal: its conditions, the response table, and what does not belong to one channel."""
+    dial = "".join(f", {name} {_shown(value)}" for name, value in (judged.get("dial") or {}).items())
     heading = (
-        f"{judged['who']} on {judged['task']} ({judged['vehicle']}, world {judged['world']}): "
+        f"{judged['who']} on {judged['task']}{dial} ({judged['vehicle']}, world {judged['world']}): "
         f"{judged['trials']} trials of {judged['duration']:g} s, starts {judged['starts']}, seed {judged['seed']}"
     )
     crossed = ", ".join(f"{name} {count}" for name, count in judged["violations"].items()) or "none"
@@ -61,6 +62,13 @@ def response_text(judged: Mapping[str, Any]) -> str:
         f"steps too small for overshoot and rise: {small}",
     ]
     return "\n".join([heading, "", response_table(judged).text(), "", *footer])
+
+
+def _shown(setting: Any) -> str:
+    """The value of a dial, or its values and the times at which it is turned to them."""
+    if not isinstance(setting, list):
+        return f"{setting:g}"
+    return ", ".join(f"{value:g} from {time:g} s on" for time, value in setting)
 
 
 def response_line(judged: Mapping[str, Any]) -> str:
