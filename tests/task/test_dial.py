@@ -146,6 +146,7 @@ def test_about_the_stated_share_of_the_dials_is_turned_before_an_update():
         (DIALS.replace("dial.calm", "dial.log"), "dial.log: cannot be used in a formula"),
         (DIALS.replace('value = "1 / speed"', 'value = "1 / quick"'), "input.share.value: quick is no dial"),
         ('[follow]\n"duration" = "8"\n', "dial: no dial, though"),
+        ("".join(f"[dial.d{i}]\nlowest = 0\nhighest = 1\ndefault = 0\n" for i in range(5)), "5 dials are not allowed"),
         (DIALS + "[dial.x]\nlow = 1\n", "dial.x.low: no such field"),
     ],
 )  # fmt: skip
@@ -160,6 +161,15 @@ def test_a_field_that_follows_a_dial_cannot_be_set_by_itself():
     with pytest.raises(BadInput, match=r"termination\.speed\.bound: follows the dials of this task, as speed"):
         load_task("dial", {"termination.speed.bound": 0.5})
     assert load_task("dial", {"dial.speed.default": 0.5}).speed_bound == 0.5
+    # its formula can
+    assert load_task("dial", {"follow.termination.speed.bound": "2 * speed"}).speed_bound == 1.6
+    assert load_task("dial", {"follow.termination.speed.bound": 0.7}).at({"speed": 0.2}).speed_bound == 0.7
+
+
+def test_a_file_may_repeat_the_value_of_a_field_that_follows_and_give_no_other(tmp_path):
+    assert load_task(file(tmp_path, DIALS + "[termination.speed]\nbound = 1.0\n")).speed_bound == 1.0
+    with pytest.raises(BadInput, match=r"mine\.toml: termination\.speed\.bound: 0\.9 is not allowed, since it follows"):
+        load_task(file(tmp_path, DIALS + "[termination.speed]\nbound = 0.9\n"))
 
 
 @pytest.mark.parametrize(

@@ -2,6 +2,7 @@
 
 import dataclasses
 import itertools
+import math
 import os
 import re
 from importlib import resources
@@ -170,11 +171,12 @@ def load_task(task: str | Path, edits: dict[str, Any] | None = None) -> Task:
     Raises:
         BadInput: unknown, unreadable, or not a task; one line that names the field.
     """
-    name = str(task)
+    name, given = str(task), {}
     if name in preset_names():
         data, where = _preset(name), ""
     elif name.endswith(".toml") or os.path.isfile(name):
-        data = _on_its_base(_with_sources({"name": Path(name).stem, **document.load(Path(name))}, name), name)
+        given = document.load(Path(name))
+        data = _on_its_base(_with_sources({"name": Path(name).stem, **given}, name), name)
         where = name
     else:
         hint = document.nearest(name, preset_names())
@@ -183,6 +185,7 @@ def load_task(task: str | Path, edits: dict[str, Any] | None = None) -> Task:
             + (f" Did you mean {hint}?" if hint else "")
         )
     task_read = _read(data, where)
+    _check_followed(task_read, given, where)
     if not edits:
         return task_read
     complete = document.plain(task_read)
@@ -253,10 +256,12 @@ def _edited(data: dict[str, Any], path: str, value: Any) -> dict[str, Any]:
     if path in data.get("follow", {}):
         formula = data["follow"][path]
         raise BadInput(
-            f"{path}: follows the dials of this task, as {formula}. Change the formula instead: "
-            f"follow.'{path}' in a task file that says based_on; or set a dial, for instance "
-            f"{' '.join(f'dial.{name}.default=...' for name in data['dial'])}."
+            f"{path}: follows the dials of this task, as {formula}. Change the formula, follow.{path}=FORMULA, or the "
+            f"default of a dial, {' '.join(f'dial.{name}.default=...' for name in data['dial'])}."
         )
+    if path.startswith("follow."):  # the path of a field, which is one key
+        formula = str(value) if isinstance(value, int | float) and not isinstance(value, bool) else value
+        return {**data, "follow": {**data.get("follow", {}), path.removeprefix("follow."): formula}}
     if path == "vehicle" and isinstance(value, str):
         return {**data, "vehicle": vehicle_table(value)}
     data = nested.edit(data, path, value)
@@ -269,11 +274,14 @@ def _edited(data: dict[str, Any], path: str, value: Any) -> dict[str, Any]:
 
 
 FOLLOWING = ("target", "noise", "reward", "termination", "vehicle", "duration")  # parts whose fields may follow a dial
+MOST_DIALS = 4  # all their settings together are checked
 CHECKED = 5  # settings of each dial at which a task is checked
 
 
 def _problem_of_dials(task: Task) -> str | None:
     """What makes the dials of a task and what follows them impossible, or None."""
+    if len(task.dial) > MOST_DIALS:
+        return f"dial: {len(task.dial)} dials are not allowed. Allowed: up to {MOST_DIALS}."
     if not task.dial and (task.follow or task.input):
         return "dial: no dial, though `follow` or `input` needs one. Allowed: one or more tables [dial.NAME]."
     for name in task.dial:
@@ -292,6 +300,23 @@ def _problem_of_dials(task: Task) -> str | None:
         if path.split(".")[0] not in FOLLOWING:
             return f"follow.{path}: cannot follow a dial. Allowed: a field of {', '.join(FOLLOWING)}."
     return None
+
+
+def _check_followed(task: Task, given: dict[str, Any], where: str) -> None:
+    """Refuse a file that gives a field another value than the formula that it follows.
+
+    Raises:
+        BadInput: the field, its value and its formula.
+    """
+    plain = document.plain(task)
+    for path, formula in task.follow.items():
+        value, now = nested.look_up(given, path), nested.look_up(plain, path)
+        same = isinstance(value, int | float) and math.isclose(value, now, rel_tol=1e-6)
+        if value is not None and not same:
+            raise BadInput(
+                f"{where}: {path}: {value} is not allowed, since it follows the dials as {formula}, which is {now:g} at "
+                "their defaults. Leave it out, or change its formula in [follow]."
+            )
 
 
 def _at_default(task: Task, where: str) -> Task:
