@@ -314,8 +314,8 @@ def _check_followed(task: Task, given: dict[str, Any], where: str) -> None:
         same = isinstance(value, int | float) and math.isclose(value, now, rel_tol=1e-6)
         if value is not None and not same:
             raise BadInput(
-                f"{where}: {path}: {value} is not allowed, since it follows the dials as {formula}, which is {now:g} at "
-                "their defaults. Leave it out, or change its formula in [follow]."
+                f"{where}: {path}: {value} is not allowed, since it follows the dials as {formula}, which is {now:g} "
+                "at their defaults. Leave it out, or change its formula in [follow]."
             )
 
 
