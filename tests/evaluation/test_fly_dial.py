@@ -6,6 +6,7 @@ import pytest
 from flytune import evaluate, find_controller, fly, judge, load_task
 from flytune.control.schedule import with_schedule
 from flytune.errors import BadInput
+from flytune.runs.find import split_setting
 
 FAMILY = load_task("dial")
 POLICY = find_controller("dial").controller
@@ -96,3 +97,34 @@ def test_a_judgement_says_at_which_setting_it_was_flown(tmp_path):
     flights.save(tmp_path / "flights.npz")
     with np.load(tmp_path / "flights.npz") as file:
         assert str(file["dial"]) == '{"speed": 0.3}'
+
+
+def test_a_name_carries_the_setting_of_one_dial_or_of_several():
+    assert split_setting("dial@speed=0.5") == ("dial", {"speed": 0.5})
+    assert split_setting("runs/x@speed=0.5,calm=1") == ("runs/x", {"speed": 0.5, "calm": 1})
+    assert split_setting("dial@speed=[[0, 0.3],[5,1]],calm=1") == ("dial", {"speed": [[0, 0.3], [5, 1]], "calm": 1})
+    assert split_setting("baseline-refined@ppo") == ("baseline-refined@ppo", {})
+    turned = find_controller("dial@speed=[[0,0.3],[5,1]]").controller
+    assert turned.setting == {"speed": [[0.0, 0.3], [5.0, 1.0]]}
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("dial@settling_time=1", r"settling_time: 1 is not allowed\. Allowed: 2\.\d+ to 1\d\.\d+ s with dial"),
+        ("dial@settling_time=fast", "settling_time: fast is not allowed"),
+        ("dial@settling_time=4,speed=1", "settling_time: sets the dial speed, which is given as well"),
+        ("dial@speed=", "speed= is not allowed"),
+        ("dial@=1", "not an assignment"),
+        ("nosuch@speed=1", "nosuch: no such controller"),
+    ],
+)
+def test_a_setting_in_a_name_that_is_none_is_refused(name, message):
+    with pytest.raises(BadInput, match=message):
+        find_controller(name)
+
+
+def test_a_settling_time_in_a_name_is_flown_within_a_tenth():
+    for wish in (2.5, 5.0):
+        judged = evaluate(f"dial@settling_time={wish}", trials=200, seed=11).judgement
+        assert judged.to_dict()["position"]["settling_time"]["median"] == pytest.approx(wish, rel=0.1)

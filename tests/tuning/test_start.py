@@ -79,3 +79,10 @@ def test_episodes_grow_by_doubling_and_what_the_user_has_set_stays():
     fixed = find_start(make_requirement(5), "baseline-refined", {"horizon": 700, "apg.updates": 77}, "apg").task
     assert (fixed.horizon, fixed.apg.updates) == (700, 77)
     assert fixed.sources["apg.updates"] == "set by the user"
+
+
+def test_the_task_with_a_dial_is_tuned_by_its_dial_and_another_with_a_dial_is_refused(tmp_path):
+    assert find_start(make_requirement(4), "dial", {}, "apg").name == "dial"
+    (tmp_path / "mine.toml").write_text('based_on = "dial"\n[dial.speed]\nhighest = 1.2\n')
+    with pytest.raises(BadInput, match=r"mine\.toml has a dial"):
+        find_start(make_requirement(4), str(tmp_path / "mine.toml"), {}, "apg")

@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import os
+import re
 from pathlib import Path
 from typing import Any
 
@@ -61,7 +62,7 @@ class FoundController:
             )
         schedule = dict(schedule)
         if SETTLING_TIME in schedule and SETTLING_TIME not in controller.dials:
-            schedule |= _by_settling_time(self.name, controller, schedule.pop(SETTLING_TIME))
+            schedule |= _by_settling_time(self.name, controller, schedule.pop(SETTLING_TIME), schedule)
         return dataclasses.replace(self, controller=with_schedule(controller, schedule), name=name or self.name)
 
     def __repr__(self) -> str:
@@ -107,8 +108,12 @@ def find_controller(name: str, task: str | Task | None = None) -> FoundControlle
     raise BadInput(f"{name}: no such controller. Allowed: {KINDS}{''.join(f', {name}' for name in shipped_names())}.")
 
 
-def _by_settling_time(name: str, controller: Any, wanted: Any) -> dict[str, float]:
-    """The setting of a dial that gives a settling time in s, by the response map that a policy carries."""
+def _by_settling_time(name: str, controller: Any, wanted: Any, given: Schedule) -> dict[str, float]:
+    """The setting of a dial that gives a settling time in s, by the response map that a policy carries.
+
+    Raises:
+        BadInput: the policy has no map, the map does not cover this time, or the dial is among those `given` as well.
+    """
     known = response_map(controller)
     if known is None:
         raise BadInput(f"{name}: carries no response map. Set its dial: {', '.join(controller.dials)}.")
@@ -119,6 +124,8 @@ def _by_settling_time(name: str, controller: Any, wanted: Any) -> dict[str, floa
             f"settling_time: {wanted} is not allowed. Allowed: {fastest:.2f} to {slowest:.2f} s with {name}; "
             "`flytune tune --settling-time S` trains a policy for other times."
         )
+    if known.dial in given:
+        raise BadInput(f"settling_time: sets the dial {known.dial}, which is given as well. Give one of the two.")
     return {known.dial: known.setting_for(wanted)}
 
 
@@ -127,7 +134,7 @@ def split_setting(name: str) -> tuple[str, dict[str, Any]]:
     base, at, setting = name.rpartition("@")
     if not at or "=" not in setting or os.path.exists(name):
         return name, {}
-    return base, dict(map(document.parse_assignment, setting.split(",")))
+    return base, dict(map(document.parse_assignment, re.split(r",(?=[^,\]]*=)", setting)))
 
 
 def _from_file(name: str, path: Path, wanted: Task | None) -> FoundController:

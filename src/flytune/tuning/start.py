@@ -52,6 +52,13 @@ def find_start(requirement: Requirement, wanted: str | None, edits: Mapping[str,
     Raises:
         BadInput: no such task, a bad edit, or a requirement that no controller can meet.
     """
+    if wanted and load_task(wanted, dict(edits)).dial:
+        if wanted != DIAL:
+            raise BadInput(
+                f"task: {wanted} has a dial. Allowed: a task without one, or {DIAL}. Train it, and set its dial: "
+                "flytune evaluate RUN@settling_time=S."
+            )
+        wanted = None  # its dial is what is set first in any case
     dialled = find_setting(requirement, edits, trainer) if not wanted else None
     tasks: dict[str, Task] = {}
     times: dict[str, float] = {}
