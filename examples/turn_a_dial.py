@@ -1,6 +1,7 @@
 """Fly one policy at three settings of its dial, and turn the dial in flight.
 
-python turn_a_dial.py
+python examples/turn_a_dial.py
+python examples/turn_a_dial.py --trials 10   for a first look
 """
 
 import argparse

@@ -32,6 +32,10 @@ class SpeedBounds:
         speed = dataclasses.replace(self.task.termination["speed"], bound=numbers)
         return dataclasses.replace(self.task, termination={**self.task.termination, "speed": speed})
 
+    def see(self, observation, numbers):
+        """The observation, and the bound."""
+        return jnp.append(observation, numbers)
+
 
 @pytest.fixture(scope="module")
 def flown():
@@ -44,7 +48,7 @@ def flown():
         draws = Draw(noise=jax.random.normal(noise, (STEPS, 13, NUMBER)), keys=jax.random.split(keys, (STEPS, NUMBER)))
 
         def decide(memory, observation, drawn, episodes):
-            return memory + 1, 0.0 * observation[:, :4], (memory, episodes.numbers)
+            return memory + 1, 0.0 * observation[:, :4], (memory, episodes.numbers, observation)
 
         count = jnp.zeros(NUMBER, jnp.int32)
         begun = (reset_all(family, jax.random.split(start, NUMBER)), count)
@@ -67,6 +71,12 @@ def test_each_episode_keeps_its_numbers_to_its_end_and_the_next_draws_its_own(fl
     over = np.asarray(outcome.terminated | outcome.truncated)
     assert over.sum() >= 2 * NUMBER  # the horizon alone ends each of them twice
     np.testing.assert_array_equal(np.diff(bounds, axis=0) != 0, over[:-1])
+
+
+def test_the_controller_is_given_what_the_family_lets_it_see(flown):
+    _, bounds, seen = flown[1].notes
+    assert seen.shape == (STEPS, NUMBER, 18)
+    np.testing.assert_array_equal(seen[..., 17], bounds)
 
 
 def test_the_margin_is_that_of_the_episode_s_own_bound(flown):
