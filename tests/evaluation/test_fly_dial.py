@@ -24,7 +24,7 @@ def test_the_bound_of_a_flight_is_that_of_the_setting():
 
 
 @pytest.mark.parametrize("to", [0.2, 1.6])
-@pytest.mark.parametrize("at", [0.05, 0.3, 1.0, 2.0, 4.0, 8.0])
+@pytest.mark.parametrize("at", [0.05, 0.5, 1.5, 6.0])
 def test_the_dial_may_be_turned_at_every_phase_of_a_flight(at, to):
     start = 1.8 - to
     flights = fly(with_schedule(POLICY, {"speed": [[0, start], [at, to]]}), FAMILY, trials=TRIALS, duration=at + 8.0)

@@ -162,7 +162,7 @@ def test_a_directory_that_cannot_be_written_is_one_line(tmp_path):
 @pytest.mark.slow
 def test_a_response_twice_as_slow_is_met_and_a_resumed_tuning_is_the_same(tmp_path):
     said = []
-    result = tune(6.0, out=tmp_path / "whole", on_message=said.append)
+    result = tune(6.0, task="inspection-refined", out=tmp_path / "whole", on_message=said.append)
     assert result.met, said
     judged = result.validations[-1].judgement
     assert judged["trials"] == 200
@@ -181,7 +181,7 @@ def test_a_response_twice_as_slow_is_met_and_a_resumed_tuning_is_the_same(tmp_pa
         shutil.rmtree(tmp_path / "cut" / "iterations" / f"{each['number']:02d}")
     told["iterations"], told["validations"] = told["iterations"][:2], []
     (tmp_path / "cut" / "tune.json").write_text(json.dumps(told))
-    again = tune(6.0, out=tmp_path / "cut", resume=True)
+    again = tune(6.0, task="inspection-refined", out=tmp_path / "cut", resume=True)
     assert [each.values for each in again.iterations] == [each.values for each in result.iterations]
     for one, other in zip(*(_weights(tmp_path / name) for name in ("whole", "cut")), strict=True):
         np.testing.assert_array_equal(one, other)
