@@ -64,6 +64,12 @@ def test_between_two_settings_the_curve_is_a_line_in_the_logarithms():
     assert known.slope() == pytest.approx(-1.0)
 
 
+def test_a_dial_with_a_value_of_zero_has_a_line_in_the_value():
+    known = a_map([0.0, 0.5, 1.0], [4.0, 2.0, 1.0])  # settling time = 4 * 4^-value
+    for value in (0.0, 0.25, 0.5, 0.8, 1.0):
+        assert known.setting_for(4.0 * 4.0**-value) == pytest.approx(value)
+
+
 def test_neighbours_in_the_wrong_order_are_pooled():
     # 3 and 4 rise where the curve falls: both become their geometric mean, sqrt(12)
     assert monotone([8.0, 3.0, 4.0, 2.0]) == pytest.approx([8.0, 12**0.5, 12**0.5, 2.0])

@@ -55,12 +55,14 @@ class ResponseMap:
     def setting_for(self, settling_time: float) -> float:
         """The value of the dial whose median settling time is nearest to the one wanted in s, by the monotone curve.
 
-        Between two settings, the curve is a line in the logarithms of value and time.
+        Between two settings, the curve is a line in the logarithms of value and time; of a dial with values of 0 or
+        less, in the value and the logarithm of time.
         """
         values, times = self._curve()
         distinct, group = np.unique(times, return_inverse=True)  # settings of one time give their mean
         means = np.bincount(group, values) / np.bincount(group)
-        return float(np.exp(np.interp(np.log(settling_time), distinct, means)))
+        found = np.interp(np.log(settling_time), distinct, means)
+        return float(np.exp(found) if self._positive else found)
 
     def slope(self) -> float:
         """d log(settling time) / d log(value), over the whole range."""
@@ -77,13 +79,17 @@ class ResponseMap:
         fastest, slowest = self.range()
         return 0.999 * fastest <= settling_time <= 1.001 * slowest
 
+    @property
+    def _positive(self) -> bool:
+        return min(self.values) > 0
+
     def _curve(self) -> tuple[np.ndarray, np.ndarray]:
-        """The logarithms of value and settling time of all settings that settle."""
+        """Value, as a logarithm where it has one, and logarithm of the settling time of all settings that settle."""
         known = [(value, time) for value, time in zip(self.values, self.monotone, strict=True) if time is not None]
         if len(known) < 2:
             raise BadInput(f"dial {self.dial}: fewer than two settings settle. Train the policy longer.")
-        values, times = np.log(np.asarray(known, float)).T
-        return values, times
+        values, times = np.asarray(known, float).T
+        return np.log(values) if self._positive else values, np.log(times)
 
     def to_dict(self) -> dict[str, Any]:
         """Plain values, for the header of a policy's file."""
@@ -97,7 +103,7 @@ class ResponseMap:
             BadInput: it is not a map.
         """
         try:
-            found = cls(**data)
+            found = cls(**{**data, "values": [float(value) for value in data["values"]]})
             found.table()
             if any(time is not None for time in found.monotone):
                 np.log(np.asarray([time for time in found.monotone if time is not None], float))
