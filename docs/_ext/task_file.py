@@ -16,6 +16,7 @@ from sphinx.application import Sphinx
 from sphinx.util.docutils import SphinxDirective
 
 from flytune.config.document import allowed
+from flytune.config.formula import Formula
 
 
 def comments(kind: type) -> dict[str, str]:
@@ -80,10 +81,15 @@ def cell(text: str) -> str:
 
 def rows(kind: type) -> Iterator[str]:
     """A row of the table for each key of a dataclass that holds no table of its own."""
-    hints, notes = get_type_hints(kind, include_extras=True), comments(kind)
+    hints = get_type_hints(kind, include_extras=True)
+    notes: dict[str, str] = {}
+    for each in reversed(kind.__mro__):  # a field may come from a class above
+        notes |= comments(each) if dataclasses.is_dataclass(each) else {}
     for field in dataclasses.fields(kind):
         annotation = hints[field.name]
         base, _ = plain(annotation)
+        if get_origin(base) is dict and plain(get_args(base)[1])[0] is Formula:
+            yield f"| `[{field.name}]` | | a table of formulas | none | {cell(notes[field.name])} |"
         if variants(annotation) or get_origin(base) is dict:
             continue
         if field.name == "kind":
@@ -113,8 +119,9 @@ def tables(kind: type, path: str, level: int) -> Iterator[str]:
         name = field.name if path == "Task" else f"{inside}.{field.name}"
         if get_origin(base) is dict:
             for variant in variants(get_args(base)[1]):
-                kinds = get_args(plain(get_type_hints(variant, include_extras=True)["kind"])[0])
-                yield from tables(variant, f'`[{name}.NAME]`, kind `"{kinds[0]}"`', level + 1)
+                hint = get_type_hints(variant, include_extras=True).get("kind")
+                kinds = f', kind `"{get_args(plain(hint)[0])[0]}"`' if hint else ""
+                yield from tables(variant, f"`[{name}.NAME]`{kinds}", level + 1)
         else:
             for variant in variants(hints[field.name]):
                 yield from tables(variant, f"`[{name}]`", level + 1)
