@@ -64,10 +64,20 @@ def test_a_formula_can_be_written_in_another_language():
     text = Formula("-2 * max(speed, 1) ** 0.5").build(
         number=str, operation=lambda name, *values: f"{name}({', '.join(values)})", constant=str
     )
-    assert text == "*(-(0.0, 2.0), **(max(speed, 1.0), 0.5))"
+    assert text == "*(-(0.0, 2.0), exp(*(0.5, log(max(speed, 1.0)))))"
 
 
 def test_the_gradient_of_a_formula_is_that_of_mathematics():
     slope = jax.grad(lambda speed: Formula("speed ** 3").value({"speed": speed}))(jnp.asarray(2.0))
     assert float(slope) == pytest.approx(3 * 2.0**2, rel=1e-5)
     assert math.isfinite(float(slope))
+
+
+def test_a_power_means_the_same_in_python_and_in_compiled_code():
+    # written as a whole number, it is a product, whatever the sign of the base; a dial as the exponent never is
+    assert Formula("(a - 2) ** -3").value({"a": 1.0}) == -1.0
+    assert float(Formula("(a - 2) ** -3").value({"a": jnp.asarray(1.0)})) == -1.0
+    with pytest.raises(ValueError, match="math domain"):
+        Formula("(a - 2) ** b").value({"a": 1.0, "b": 2.0})
+    assert math.isnan(float(Formula("(a - 2) ** b").value({"a": jnp.asarray(1.0), "b": jnp.asarray(2.0)})))
+    assert Formula("a ** b").value({"a": 3.0, "b": 2.0}) == pytest.approx(9.0)

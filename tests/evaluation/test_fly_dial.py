@@ -1,11 +1,17 @@
 """Flights with a dial: the bound that follows it, turned in flight, in every simulator, in exports."""
 
+import dataclasses
+
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from flytune import evaluate, find_controller, fly, judge, load_task
+from flytune import evaluate, export_policy, find_controller, fly, judge, load_task
+from flytune.cli.main import main
 from flytune.control.schedule import with_schedule
 from flytune.errors import BadInput
+from flytune.evaluation.measure_map import measure_map
 from flytune.runs.find import split_setting
 
 FAMILY = load_task("dial")
@@ -64,8 +70,6 @@ def test_a_schedule_flies_the_same_in_another_simulator():
 
 def test_a_schedule_flies_the_same_from_an_onnx_file(tmp_path):
     pytest.importorskip("onnxruntime")
-    from flytune import export_policy
-
     path = export_policy(POLICY, tmp_path / "dial.onnx")
     schedule = {"speed": [[0, 0.4], [2.0, 1.2]]}
     here, there = (
@@ -89,10 +93,10 @@ def test_a_judgement_says_at_which_setting_it_was_flown(tmp_path):
     flights = fly(POLICY.at(speed=0.3), FAMILY, trials=2, duration=1.0)
     judged = judge(flights)
     assert judged.to_dict()["dial"] == {"speed": 0.3}
-    assert "on dial, speed 0.3 (crazyflie" in judged.table()
+    assert "on dial (crazyflie, world flytune, dial speed 0.3): " in judged.table()
     turned = evaluate("dial", dial={"speed": [[0, 0.3], [0.5, 1.0]]}, trials=2, duration=1.0).judgement
     assert turned.to_dict()["dial"] == {"speed": [[0.0, 0.3], [0.5, 1.0]]}
-    assert "speed 0.3 from 0 s on, 1 from 0.5 s on (crazyflie" in turned.table()
+    assert "dial speed 0.3 from 0 s on, 1 from 0.5 s on): " in turned.table()
     assert evaluate("lqr", trials=2, duration=1.0).judgement.to_dict()["dial"] is None
     flights.save(tmp_path / "flights.npz")
     with np.load(tmp_path / "flights.npz") as file:
@@ -128,3 +132,72 @@ def test_a_settling_time_in_a_name_is_flown_within_a_tenth():
     for wish in (2.5, 5.0):
         judged = evaluate(f"dial@settling_time={wish}", trials=200, seed=11).judgement
         assert judged.to_dict()["position"]["settling_time"]["median"] == pytest.approx(wish, rel=0.1)
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass
+class WithOtherSettings:
+    """A controller of a user that has fields of these names and no dial."""
+
+    settings: float = 1.0
+    setting: float = 2.0
+
+    def initial_memory(self):
+        return ()
+
+    def act(self, memory, observation):
+        return memory, jnp.zeros(4)
+
+
+@pytest.mark.parametrize("task", ["baseline", "dial"])
+def test_a_controller_without_dials_may_have_any_fields(task):
+    flights = fly(WithOtherSettings(), load_task(task), trials=2, duration=1.0)
+    assert flights.dial == {}
+    assert flights.speed_bound == pytest.approx(0.8)
+
+
+@pytest.mark.parametrize("value", [0.5, np.float32(0.5), np.float64(0.5), jnp.asarray(0.5), np.asarray(0.5)])
+def test_a_setting_may_be_a_number_of_python_numpy_or_jax(value):
+    assert POLICY.at(speed=value).setting == {"speed": 0.5}
+    assert FAMILY.at({"speed": value}).speed_bound == 0.5
+    assert with_schedule(POLICY, {"speed": [[0, value], [np.float32(1), 1]]}).setting["speed"][0] == [0.0, 0.5]
+
+
+@pytest.mark.parametrize("value", [True, np.bool_(True), "0.5", None, np.asarray([0.5]), [0.5], 1j])
+def test_a_setting_that_is_no_number_is_refused(value):
+    with pytest.raises(BadInput, match="dial: "):
+        with_schedule(POLICY, {"speed": value})
+
+
+def test_a_policy_is_exported_at_one_setting_with_the_task_of_this_setting(tmp_path):
+    path = tmp_path / "slow.safetensors"
+    assert main(["export", "dial@speed=0.5", "--format", "safetensors", "--out", str(path)]) == 0
+    slow = find_controller(str(path))
+    assert slow.controller.actor.sizes == (17, 64, 64, 4)
+    assert slow.task.speed_bound == 0.5
+    assert slow.about["dial"] == "speed=0.5"
+    flights = [fly(each, FAMILY.at({"speed": 0.5}), trials=5, duration=3.0) for each in (slow, POLICY.at(speed=0.5))]
+    assert np.abs(flights[0].position - flights[1].position).max() < 1e-3
+
+
+@pytest.mark.parametrize("name", ["dial@speed=[[0,0.3],[5,1]]", "onnx@speed=0.5"])
+def test_what_has_no_weights_at_one_setting_is_not_exported(tmp_path, capsys, name):
+    pytest.importorskip("onnxruntime")
+    export_policy(POLICY, tmp_path / "onnx.onnx")
+    name = name.replace("onnx@", f"{tmp_path / 'onnx.onnx'}@")
+    assert main(["export", name, "--format", "onnx", "--out", str(tmp_path / "out.onnx")]) == 2
+    assert "cannot be written at one setting" in capsys.readouterr().err
+    assert not (tmp_path / "out.onnx").exists()
+
+
+def test_the_map_of_an_onnx_file_is_measured_and_that_of_a_schedule_is_the_policys(tmp_path, capsys):
+    pytest.importorskip("onnxruntime")
+    path = export_policy(POLICY, tmp_path / "dial.onnx")
+    assert main(["map", "dial@speed=[[0,0.3],[5,1]]"]) == 0
+    carried = capsys.readouterr().out
+    assert main(["map", "dial"]) == 0
+    assert capsys.readouterr().out == carried
+    measured = measure_map(find_controller(str(path)).controller, FAMILY, settings=2, trials=5)
+    assert measured.settled == [5, 5]
+    assert main(["map", "pid"]) == 2
+    assert "pid: has no dial" in capsys.readouterr().err

@@ -157,9 +157,20 @@ def test_dials_that_cannot_work_are_refused_in_one_line(tmp_path, text, message)
     assert "\n" not in str(error.value)
 
 
-def test_a_field_that_follows_a_dial_cannot_be_set_by_itself():
+@pytest.mark.parametrize(
+    "edit",
+    [
+        {"termination.speed.bound": 0.5},
+        {"termination.speed": {"kind": "maximum_speed", "bound": 0.5}},
+        {"termination": {"speed": {"kind": "maximum_speed", "bound": 0.5}}},
+    ],
+)
+def test_a_field_that_follows_a_dial_cannot_be_set_by_itself(edit):
     with pytest.raises(BadInput, match=r"termination\.speed\.bound: follows the dials of this task, as speed"):
-        load_task("dial", {"termination.speed.bound": 0.5})
+        load_task("dial", edit)
+
+
+def test_the_dial_or_the_formula_of_a_field_that_follows_it_can_be_set():
     assert load_task("dial", {"dial.speed.default": 0.5}).speed_bound == 0.5
     # its formula can
     assert load_task("dial", {"follow.termination.speed.bound": "2 * speed"}).speed_bound == 1.6

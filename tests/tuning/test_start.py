@@ -86,3 +86,21 @@ def test_the_task_with_a_dial_is_tuned_by_its_dial_and_another_with_a_dial_is_re
     (tmp_path / "mine.toml").write_text('based_on = "dial"\n[dial.speed]\nhighest = 1.2\n')
     with pytest.raises(BadInput, match=r"mine\.toml has a dial"):
         find_start(make_requirement(4), str(tmp_path / "mine.toml"), {}, "apg")
+
+
+def test_a_requirement_that_a_bound_of_the_user_forbids_is_refused_though_the_dial_would_meet_it():
+    # the dial turns the yaw in 0.24 s, but at 100 deg/s the median trial takes longer
+    edits = {"termination.body_rate.bound_deg_per_s": 100.0}
+    with pytest.raises(BadInput, match="the body rate bound of 100 deg/s you have set"):
+        find_start(make_requirement(0.4, axis="yaw", at_most=True), None, edits, "apg")
+    assert find_start(make_requirement(0.4, axis="yaw", at_most=True), None, {}, "apg").name == "dial"
+
+
+def test_a_bound_of_the_user_that_the_dial_breaks_lets_the_other_policies_be_tried():
+    edits = {"termination.body_rate.bound_deg_per_s": 150.0}
+    assert len(find_start(make_requirement(4), None, edits, "apg").times) > 1
+
+
+def test_the_dial_is_set_within_the_range_that_the_user_gives():
+    start = find_start(make_requirement(2.2), None, {"dial.speed.highest": 1.0}, "apg")
+    assert start.setting["speed"] <= 1.0

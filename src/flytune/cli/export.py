@@ -1,7 +1,7 @@
 """`flytune export`."""
 
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 from cyclopts import Parameter
 
@@ -28,6 +28,6 @@ def export(controller: PolicyName, /, *, file_format: Format, out: File) -> None
     from flytune.runs.find import find_controller, split_setting
 
     check_file(out)
-    found: Any = find_controller(controller)
-    has_setting = bool(split_setting(controller)[1])
-    print(export_policy(found.controller.fixed() if has_setting else found, out, file_format))
+    found = find_controller(controller)
+    _, setting = split_setting(controller)
+    print(export_policy(found.fixed() if setting else found, out, file_format))

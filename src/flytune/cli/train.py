@@ -31,7 +31,7 @@ def train(
 ) -> None:
     """Train a policy for a task, and print its run directory last."""
     from flytune.control.policy import save_policy
-    from flytune.control.response_map import response_map
+    from flytune.control.response_map import ResponseMap
     from flytune.evaluation.evaluate import evaluate, write_evaluation
     from flytune.evaluation.measure_map import with_maps
     from flytune.runs.directory import new_directory
@@ -53,8 +53,8 @@ def train(
         print("measuring the response at each setting of the dial", file=sys.stderr)
         policy = with_maps(run.policy, wanted)
         save_policy(out / "policy.safetensors", policy)
-        for name in policy.dials:
-            print(response_map(policy, name).table(), end="\n\n")  # pyright: ignore[reportOptionalMemberAccess]
+        for each in policy.maps.values():
+            print(ResponseMap.read(each).table(), end="\n\n")
     evaluation = evaluate(run.policy, wanted, name=str(out))
     write_evaluation(out, evaluation.judgement)
     print(evaluation.judgement.line())

@@ -38,7 +38,8 @@ class Formula(str):
     def value(self, numbers: Mapping[str, Any]) -> Any:
         """The value where each name has a number, of Python or of JAX.
 
-        A power whose exponent is no whole number is computed as exp(b log a), so its base has to be positive.
+        A power whose exponent is written as a whole number is a product. Any other is computed as exp(b log a), so its
+        base has to be positive.
 
         Raises:
             ValueError: it is not a formula, or a name has no number.
@@ -95,6 +96,10 @@ def _walk(
             return constant(float(value))
         case ast.Name(id=name):
             return number(name)
+        case ast.BinOp(left=left, op=ast.Pow(), right=right) if _whole(right) is None:
+            return apply("exp", apply("*", inner(right), apply("log", inner(left))))
+        case ast.BinOp(left=left, op=ast.Pow(), right=right):
+            return apply("**", inner(left), constant(float(_whole(right) or 0)))
         case ast.BinOp(left=left, op=operator, right=right) if type(operator) in OPERATORS:
             return apply(OPERATORS[type(operator)], inner(left), inner(right))
         case ast.UnaryOp(op=ast.USub(), operand=operand):
@@ -102,6 +107,16 @@ def _walk(
         case ast.Call(func=ast.Name(id=name), args=arguments, keywords=[]) if FUNCTIONS.get(name) == len(arguments):
             return apply(name, *map(inner, arguments))
     raise ValueError(f"{ast.unparse(node)} is not allowed, allowed: {ALLOWED}")
+
+
+def _whole(exponent: ast.expr) -> int | None:
+    """The exponent where it is written as a whole number of at most 16, also a negative one; else None."""
+    match exponent:
+        case ast.UnaryOp(op=ast.USub(), operand=operand) if (positive := _whole(operand)) is not None:
+            return -positive
+        case ast.Constant(value=int() | float() as value) if float(value).is_integer() and abs(value) <= 16:
+            return int(value)
+    return None
 
 
 def _plain(operation: str, *values: float) -> float:
@@ -127,10 +142,8 @@ def _compute(operation: str, values: tuple[Any, ...], library: Any) -> Any:
             return values[0] * values[1]
         case "/":
             return values[0] / values[1]
-        case "**" if isinstance(values[1], float) and values[1].is_integer() and abs(values[1]) <= 16:
-            return values[0] ** int(values[1])
         case "**":
-            return library.exp(values[1] * library.log(values[0]))
+            return values[0] ** int(values[1])
         case "min" | "max":
             if library is math:
                 return (min if operation == "min" else max)(values)

@@ -97,7 +97,7 @@ class Policy:
         dials = "".join(f", {name} {float(self.setting[name]):g}" for name in self.dials)
         return f"Policy({sizes}, {self.squash}{made_for}{dials})"
 
-    def at(self, setting: Setting | None = None, /, **values: float) -> "Policy":
+    def at(self, setting: Setting | None = None, /, **values: Any) -> "Policy":
         """The policy with its dials set; a dial that is not named keeps its value.
 
         Raises:

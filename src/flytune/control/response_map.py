@@ -114,8 +114,9 @@ class ResponseMap:
 
 def response_map(policy: Any, dial: str | None = None) -> ResponseMap | None:
     """The response map that a policy carries along a dial, the first one where None; None where it carries none."""
-    name = dial or next(iter(policy.maps), "")
-    return ResponseMap.read(policy.maps[name]) if name in policy.maps else None
+    maps = getattr(policy, "maps", {})  # the file of another program has none
+    name = dial or next(iter(maps), "")
+    return ResponseMap.read(maps[name]) if name in maps else None
 
 
 def monotone(times: Sequence[float | None]) -> list[float | None]:

@@ -1,6 +1,7 @@
 """A policy whose dials are turned in flight, at given times."""
 
 import itertools
+import math
 from collections.abc import Mapping
 from typing import Any, Protocol, runtime_checkable
 
@@ -12,7 +13,8 @@ from jaxtyping import Array, Float, Int
 from flytune.config.pytree import pytree
 from flytune.errors import BadInput
 from flytune.physics.dynamics import CONTROL_PERIOD
-from flytune.task.dial import Dial, Setting, checked_setting
+from flytune.task.dial import Dial, Setting, as_number, checked_setting
+from flytune.task.task import Task
 
 Schedule = Mapping[str, Any]  # dial -> its value; or [[time in s, value], ...], the first at 0
 
@@ -124,8 +126,27 @@ def with_schedule(policy: Dialled, schedule: Schedule) -> Any:
     return ScheduledPolicy(policy=policy, first_steps=first_steps, shares=shares) if shares else policy
 
 
+def settings_along(controller: Any, task: Task, steps: int) -> dict[str, Float[np.ndarray, "steps"]]:
+    """The value of each dial of a task at the first control steps of a flight.
+
+    A dial that the controller has is set as the controller says; any other is at its default.
+    """
+    own: Mapping[str, Any] = {}
+    if isinstance(controller, ScheduledPolicy):
+        own = controller.settings(steps)
+    elif getattr(controller, "dials", {}):
+        own = controller.setting
+    return {name: np.full(steps, own.get(name, dial.default), float) for name, dial in task.dial.items()}
+
+
+def shown_setting(controller: Any) -> dict[str, Any]:
+    """The setting of a controller's dials in plain numbers of six digits, see `Schedule`; empty for one without."""
+    setting = controller.setting if getattr(controller, "dials", {}) else {}
+    return {name: value if isinstance(value, list) else float(f"{float(value):.6g}") for name, value in setting.items()}
+
+
 def _pair(name: str, given: Any) -> tuple[float, float]:
-    numbers = np.asarray(given, object)
-    if numbers.shape != (2,) or not all(isinstance(x, int | float) and np.isfinite(x) for x in numbers):
+    time, value = map(as_number, given) if isinstance(given, list | tuple) and len(given) == 2 else (None, None)
+    if time is None or value is None or not (math.isfinite(time) and math.isfinite(value)):
         raise BadInput(f"dial: {name}: {given} is not allowed. Allowed: a pair [time in s, value].")
-    return float(numbers[0]), float(numbers[1])
+    return time, value

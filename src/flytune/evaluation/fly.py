@@ -10,13 +10,15 @@ import jax.numpy as jnp
 import numpy as np
 
 from flytune.control.controller import Controller
+from flytune.control.schedule import ScheduledPolicy, settings_along, shown_setting
 from flytune.errors import BadInput, Diverged
 from flytune.evaluation.flights import Flights
+from flytune.evaluation.margins import CHUNK, largest_speed_bound, recorded_margins
 from flytune.kernels.programs import program
 from flytune.physics.dynamics import CONTROL_PERIOD
 from flytune.physics.vehicle import Vehicle
 from flytune.runs.find import FoundController
-from flytune.simulation.environment import Episode, begin, hold, is_crashed, margins_along
+from flytune.simulation.environment import Episode, begin, hold, is_crashed
 from flytune.simulation.host import HostEnvironment, ravel
 from flytune.simulation.rollout import Draw, rollout
 from flytune.simulation.simulator import WIDTHS, Simulator, VehicleStates, state_from, state_numbers
@@ -27,7 +29,6 @@ from flytune.task.task import Task
 
 ACTION = slice(SIZE - 4, SIZE)  # of an observation: the last action, which carries no noise
 InitialConditions = Literal["clear", "paper"]
-CHUNK = 100  # steps that are flown by one compiled program
 
 
 def fly(
@@ -65,7 +66,7 @@ def fly(
     """
     if isinstance(controller, FoundController):
         controller, name = controller.controller, name or controller.name
-    family, task = task, task.at(_setting(controller, task))
+    family, task = task, task.at({name: values[0] for name, values in settings_along(controller, task, 1).items()})
     duration = task.duration if duration is None else duration
     if not 1 <= trials <= 100_000:
         raise BadInput(f"trials: {trials} is not allowed. Allowed: a whole number, 1 to 100000.")
@@ -94,58 +95,25 @@ def fly(
     finally:
         made.close()
     states, actions = np.asarray(record.states), np.asarray(record.actions)
-    turned = _turned(controller, family, steps)
-    margins = _margins_along(family if turned else task, turned, states, actions)
+    along = settings_along(controller, family, steps + 1) if isinstance(controller, ScheduledPolicy) else {}
     trajectories = VehicleStates.from_rows(np.ascontiguousarray(states.transpose(2, 0, 1)))
     return Flights(
         time=np.arange(steps + 1) * CONTROL_PERIOD,
         **{field: getattr(trajectories, field) for field in WIDTHS},
         action=np.ascontiguousarray(actions.transpose(2, 0, 1)),
         crashed=np.asarray(record.crashed),
-        margins=margins,
+        margins=recorded_margins(family if along else task, along, states, actions),
         target_position=np.asarray(task.target.position),
         target_yaw=float(task.target.yaw),
-        speed_bound=_largest_speed_bound(family, turned) if turned else task.speed_bound,
+        speed_bound=largest_speed_bound(family, along) if along else task.speed_bound,
         name=name,
         task=task.name,
         vehicle=task.vehicle.name,
         simulator=simulator_name,
         seed=seed,
         initial_conditions=initial_conditions,
-        dial=_dial_label(controller),
+        dial=shown_setting(controller),
     )
-
-
-def _dial_label(controller: Any) -> dict[str, Any]:
-    """The setting of a controller's dials in plain numbers, with six digits; empty for one without dials."""
-    setting = getattr(controller, "setting", {}) if getattr(controller, "dials", {}) else {}
-    return {name: value if isinstance(value, list) else float(f"{float(value):.6g}") for name, value in setting.items()}
-
-
-def _setting(controller: Any, task: Task) -> dict[str, float]:
-    """The setting of a task's dials that a controller flies: its own of the dials that it has, the default of others.
-
-    Of a controller whose dials are turned in flight, it is that of the start.
-    """
-    own = getattr(controller, "setting", {})
-    if hasattr(controller, "settings"):
-        own = {name: values[0] for name, values in controller.settings(1).items()}
-    return {name: float(own.get(name, dial.default)) for name, dial in task.dial.items()}
-
-
-def _turned(controller: Any, task: Task, steps: int) -> dict[str, np.ndarray]:
-    """The setting of the task's dials at samples 0 to T where the controller turns them in flight; else empty."""
-    if not task.dial or not hasattr(controller, "settings"):
-        return {}
-    own = controller.settings(steps + 1)
-    return {name: own.get(name, np.full(steps + 1, float(dial.default))) for name, dial in task.dial.items()}
-
-
-def _largest_speed_bound(task: Task, settings: dict[str, np.ndarray]) -> float | None:
-    """The largest speed bound of a flight in which the dials are turned, None where a setting has none."""
-    ends = [{name: float(pick(values)) for name, values in settings.items()} for pick in (np.min, np.max)]
-    bounds = [task.at(each).speed_bound for each in ends]
-    return None if None in bounds else max(bound for bound in bounds if bound is not None)
 
 
 def _check_controller(controller: Any) -> None:
@@ -337,34 +305,6 @@ def _decide(controller: Any, memory: Any, seen: jax.Array) -> tuple[Any, jax.Arr
     memory, given = jax.vmap(controller.act)(memory, seen)
     finite = jnp.all(jnp.isfinite(given), axis=-1) | ~jnp.all(jnp.isfinite(seen), axis=-1)
     return memory, jnp.clip(given, -1.0, 1.0), given, finite
-
-
-def _margins_along(
-    task: Task, settings: dict[str, np.ndarray], states: np.ndarray, actions: np.ndarray
-) -> dict[str, np.ndarray]:
-    """The margins [N, T + 1] of states [T + 1, 17, N] under actions [T + 1, 4, N].
-
-    Where the dials of the task are turned in flight, `settings` has their value at each sample, [T + 1]; else it is
-    empty. One compiled program computes `CHUNK` samples at a time, whatever the duration.
-    """
-    changes, samples = np.diff(actions, axis=0, prepend=np.zeros_like(actions[:1])), len(states)
-    parts = []
-    for first in range(0, samples, CHUNK):
-        rows = np.minimum(np.arange(first, first + CHUNK), samples - 1)
-        here = {name: np.asarray(values[rows], np.float32) for name, values in settings.items()}
-        parts.append(_margins(task, here, states[rows], changes[rows]))
-    return {name: np.concatenate([np.asarray(part[name]) for part in parts], axis=-1)[:, :samples] for name in parts[0]}
-
-
-@program()
-def _margins(task: Task, settings: dict[str, jax.Array], states: jax.Array, changes: jax.Array) -> dict[str, jax.Array]:
-    """The margins [N, samples] of states [samples, 17, N] under changes of the action [samples, 4, N]."""
-
-    def one(numbers: jax.Array, changes: jax.Array) -> dict[str, jax.Array]:
-        none_pending = jnp.zeros((len(changes), task.vehicle.action_latency_steps, 4))
-        return margins_along(task, settings, state_from(numbers.T, none_pending), changes)
-
-    return jax.vmap(one, in_axes=-1)(states, changes)
 
 
 def _not_finite(name: str, action: Any, trial: int | np.integer, step: int | np.integer) -> Diverged:

@@ -1,6 +1,7 @@
 """The measurement of a response map: a policy flies at many settings of its dial."""
 
 import dataclasses
+from typing import Any
 
 import numpy as np
 
@@ -17,12 +18,12 @@ LEAST_SETTLED = 0.95  # of the feasible trials; at a setting with fewer, the map
 
 
 def measure_map(
-    policy: Policy, task: Task, dial: str | None = None, *, settings: int = SETTINGS, trials: int = TRIALS
+    policy: Any, task: Task, dial: str | None = None, *, settings: int = SETTINGS, trials: int = TRIALS
 ) -> ResponseMap:
     """The response map of a policy along one of its dials, measured in flight.
 
     Args:
-        policy: with dials.
+        policy: with dials: a `Policy`, or the file of another program.
         task: the task of its training.
         dial: the name of the dial; the first one where None.
         settings: number of values, even in the spacing of the dial.

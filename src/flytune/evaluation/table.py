@@ -46,9 +46,9 @@ def _row(name: str, channel: Mapping[str, Any], trials: int) -> dict[str, Any]:
 
 def response_text(judged: Mapping[str, Any]) -> str:
     """One judgement for a terminal: its conditions, the response table, and what does not belong to one channel."""
-    dial = "".join(f", {name} {_shown(value)}" for name, value in (judged.get("dial") or {}).items())
+    dial = "".join(f", dial {name} {_shown(value)}" for name, value in (judged.get("dial") or {}).items())
     heading = (
-        f"{judged['who']} on {judged['task']}{dial} ({judged['vehicle']}, world {judged['world']}): "
+        f"{judged['who']} on {judged['task']} ({judged['vehicle']}, world {judged['world']}{dial}): "
         f"{judged['trials']} trials of {judged['duration']:g} s, starts {judged['starts']}, seed {judged['seed']}"
     )
     crossed = ", ".join(f"{name} {count}" for name, count in judged["violations"].items()) or "none"

@@ -12,7 +12,7 @@ import jax
 from flytune.config import document
 from flytune.control.classical import CLASSICAL, classical_controller
 from flytune.control.controller import Controller
-from flytune.control.policy import load_policy
+from flytune.control.policy import Policy, load_policy
 from flytune.control.response_map import response_map
 from flytune.control.schedule import Schedule, with_schedule
 from flytune.errors import BadInput
@@ -20,7 +20,8 @@ from flytune.export.untrusted.onnx_controller import load_onnx
 from flytune.export.untrusted.sb3_model import load_sb3
 from flytune.runs.directory import has_checkpoint, read_facts, resume_command
 from flytune.runs.shipped import shipped_files, shipped_names
-from flytune.task.task import Task, load_task, read_task_text
+from flytune.task.dial import as_number
+from flytune.task.task import Task, load_task, read_task_text, write_task
 
 SETTLING_TIME = "settling_time"
 READERS = {".safetensors": load_policy, ".onnx": load_onnx, ".zip": load_sb3}
@@ -65,6 +66,19 @@ class FoundController:
             schedule |= _by_settling_time(self.name, controller, schedule.pop(SETTLING_TIME), schedule)
         return dataclasses.replace(self, controller=with_schedule(controller, schedule), name=name or self.name)
 
+    def fixed(self) -> Policy:
+        """The policy at its setting without its dials, with the task at this setting in its header.
+
+        Raises:
+            BadInput: it is no policy with weights at one setting.
+        """
+        if not isinstance(self.controller, Policy):
+            raise BadInput(
+                f"{self.name}: cannot be written at one setting. Allowed: a policy with its weights, from a run "
+                "directory, a .safetensors file, or one that ships; its dials not turned in flight."
+            )
+        return fixed_policy(self.controller, self.task)
+
     def __repr__(self) -> str:
         return f"FoundController({self.name}, {self.controller!r}, for {self.task.name})"
 
@@ -108,6 +122,14 @@ def find_controller(name: str, task: str | Task | None = None) -> FoundControlle
     raise BadInput(f"{name}: no such controller. Allowed: {KINDS}{''.join(f', {name}' for name in shipped_names())}.")
 
 
+def fixed_policy(policy: Policy, task: Task) -> Policy:
+    """The policy at its setting without its dials; its header names the setting and holds the task at this setting."""
+    fixed_task = task.at({name: value for name, value in policy.setting.items() if name in task.dial})
+    words = ", ".join(f"{name}={float(value):g}" for name, value in policy.setting.items())
+    about = {**policy.about, "task_toml": write_task(fixed_task), **({"dial": words} if words else {})}
+    return dataclasses.replace(policy.fixed(), about=about)
+
+
 def _by_settling_time(name: str, controller: Any, wanted: Any, given: Schedule) -> dict[str, float]:
     """The setting of a dial that gives a settling time in s, by the response map that a policy carries.
 
@@ -117,8 +139,8 @@ def _by_settling_time(name: str, controller: Any, wanted: Any, given: Schedule) 
     known = response_map(controller)
     if known is None:
         raise BadInput(f"{name}: carries no response map. Set its dial: {', '.join(controller.dials)}.")
-    is_number = isinstance(wanted, int | float) and not isinstance(wanted, bool)
-    if not is_number or not known.covers(wanted):
+    time = as_number(wanted)
+    if time is None or not known.covers(time):
         fastest, slowest = known.range()
         raise BadInput(
             f"settling_time: {wanted} is not allowed. Allowed: {fastest:.2f} to {slowest:.2f} s with {name}; "
@@ -126,7 +148,7 @@ def _by_settling_time(name: str, controller: Any, wanted: Any, given: Schedule) 
         )
     if known.dial in given:
         raise BadInput(f"settling_time: sets the dial {known.dial}, which is given as well. Give one of the two.")
-    return {known.dial: known.setting_for(wanted)}
+    return {known.dial: known.setting_for(time)}
 
 
 def split_setting(name: str) -> tuple[str, dict[str, Any]]:

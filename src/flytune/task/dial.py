@@ -7,6 +7,7 @@ from typing import Annotated, Any, Literal, TypeVar
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from annotated_types import Ge, Le, Unit
 from jaxtyping import Array, Float
 
@@ -26,9 +27,9 @@ TOLERANCE = 1e-6  # share of a range, by which rounding may exceed it
 class Dial:
     """A number that may be set at any time, also in flight. In training it is drawn at random for each episode."""
 
-    lowest: Annotated[Real, Unit("see unit")]
-    highest: Annotated[Real, Unit("see unit")]
-    default: Annotated[Real, Unit("see unit")]
+    lowest: Annotated[Real, Unit("in its unit")]
+    highest: Annotated[Real, Unit("in its unit")]
+    default: Annotated[Real, Unit("in its unit")]
     spacing: Literal["linear", "logarithmic"] = static(default="linear")  # drawn evenly in the value or its logarithm
     turned: Annotated[Real, Ge(0), Le(1), Unit("1")] = 0.0  # share of the episodes in which each update turns it
     sweep_time: Annotated[Real, Ge(0), Unit("s")] = 0.0  # in flight, a turn over the whole range takes this long
@@ -132,15 +133,21 @@ def checked_setting(dials: Mapping[str, Dial], setting: Setting, where: str = "d
         if name not in dials:
             allowed = f"Allowed: {', '.join(dials)}" if dials else "This one has no dial"
             raise BadInput(f"{where}: {name!r} is no dial here. {allowed}.")
-        dial, number = dials[name], isinstance(value, int | float) and not isinstance(value, bool)
+        dial, number = dials[name], as_number(value)
         room = TOLERANCE * abs(dial.highest - dial.lowest)
-        if not number or not dial.lowest - room <= value <= dial.highest + room:
+        if number is None or not dial.lowest - room <= number <= dial.highest + room:
             unit = f" {dial.unit}" if dial.unit else ""
             raise BadInput(
                 f"{where}: {name}={value} is not allowed. Allowed: {dial.lowest:g} to {dial.highest:g}{unit}."
             )
-        values[name] = min(max(float(value), float(dial.lowest)), float(dial.highest))
+        values[name] = min(max(number, float(dial.lowest)), float(dial.highest))
     return values
+
+
+def as_number(value: Any) -> float | None:
+    """A number of Python, NumPy or JAX as a float; None of anything else, also of text, a truth value and an array."""
+    kind = getattr(getattr(value, "dtype", None), "kind", "f" if type(value) in (int, float) else "")
+    return float(value) if kind in ("f", "i", "u") and np.ndim(value) == 0 else None
 
 
 def with_field(node: Any, path: tuple[str, ...], value: Any) -> Any:

@@ -253,11 +253,13 @@ def _read(data: dict[str, Any], where: str = "") -> Task:
 
 def _edited(data: dict[str, Any], path: str, value: Any) -> dict[str, Any]:
     """The task's tables after one edit, the source of what was edited now the user."""
-    if path in data.get("follow", {}):
-        formula = data["follow"][path]
+    followed = [each for each in data.get("follow", {}) if f"{each}.".startswith(f"{path}.")]
+    if followed and (path in followed or isinstance(value, dict)):
+        formula = data["follow"][followed[0]]
         raise BadInput(
-            f"{path}: follows the dials of this task, as {formula}. Change the formula, follow.{path}=FORMULA, or the "
-            f"default of a dial, {' '.join(f'dial.{name}.default=...' for name in data['dial'])}."
+            f"{followed[0]}: follows the dials of this task, as {formula}. Change the formula, "
+            f"follow.{followed[0]}=FORMULA, or the default of a dial, "
+            f"{' '.join(f'dial.{name}.default=...' for name in data['dial'])}."
         )
     if path.startswith("follow."):  # the path of a field, which is one key
         formula = str(value) if isinstance(value, int | float) and not isinstance(value, bool) else value
@@ -275,7 +277,7 @@ def _edited(data: dict[str, Any], path: str, value: Any) -> dict[str, Any]:
 
 FOLLOWING = ("target", "noise", "reward", "termination", "vehicle", "duration")  # parts whose fields may follow a dial
 MOST_DIALS = 4  # all their settings together are checked
-CHECKED = 5  # settings of each dial at which a task is checked
+CHECKED = {1: 9, 2: 5, 3: 4, 4: 3}  # number of dials -> settings of each at which a task is checked
 
 
 def _problem_of_dials(task: Task) -> str | None:
@@ -328,7 +330,7 @@ def _at_default(task: Task, where: str) -> Task:
     if not task.dial:
         return task
     prefix = f"{where}: " if where else ""
-    settings = itertools.product(*(dial.grid(CHECKED) for dial in task.dial.values()))
+    settings = itertools.product(*(dial.grid(CHECKED[len(task.dial)]) for dial in task.dial.values()))
     default = {name: dial.default for name, dial in task.dial.items()}
     for values in settings:
         _at(task, dict(zip(task.dial, values, strict=True)), prefix)

@@ -9,12 +9,14 @@ from typing import Any
 from flytune.control.policy import Policy, load_policy
 from flytune.control.response_map import response_map
 from flytune.errors import BadInput
-from flytune.evaluation.judge import Judgement
+from flytune.evaluation.flights import Flights
+from flytune.evaluation.judge import Judgement, judge
+from flytune.runs.find import fixed_policy
 from flytune.runs.shipped import shipped_files, shipped_name, shipped_names
-from flytune.task.task import Task, load_task, write_task
-from flytune.tuning.flying import fly_for
+from flytune.task.task import Task, load_task
+from flytune.tuning.flying import flights_for
 from flytune.tuning.history import TRAINING_SEED, TRAINING_TRIALS
-from flytune.tuning.requirement import Requirement, ResponseSummary
+from flytune.tuning.requirement import Requirement, ResponseSummary, constraints_of
 
 DIAL = "dial"  # the task of the policy
 MOST_TURNS = 3  # of the dial, each with a flight of the training set
@@ -28,9 +30,9 @@ class DialStart:
     task: Task
     policy: Policy
     record: Path  # run.json of the training
-    judgement: Judgement  # on the training set
+    flights: Flights  # on the training set
+    judgement: Judgement  # of these
     response: ResponseSummary
-    flights: int  # how often the dial was turned
 
 
 def find_setting(requirement: Requirement, edits: Mapping[str, Any], trainer: str) -> DialStart | None:
@@ -52,11 +54,12 @@ def find_setting(requirement: Requirement, edits: Mapping[str, Any], trainer: st
     known = response_map(policy)
     if known is None:
         return None
-    target, aim, dial = requirement.tightened(), requirement.aim(), policy.dials[known.dial]
+    target, aim, dial = requirement.tightened(), requirement.aim(), family.dial[known.dial]
     value, best = known.setting_for(aim), None
-    for turn in range(1, MOST_TURNS + 1):
-        value = float(f"{min(max(value, dial.lowest), dial.highest):.4g}")
-        start = _flown(requirement, family, policy, {known.dial: value}, record, turn)
+    constraints = constraints_of(family, edits)
+    for _ in range(MOST_TURNS):
+        value = min(max(float(f"{value:.4g}"), dial.lowest), dial.highest)
+        start = _flown(requirement, family, policy.at({known.dial: value}), record, constraints)
         if best is None or target.distance(start.response) < target.distance(best.response):
             best = start
         measured = start.response.settling_time
@@ -70,19 +73,18 @@ def find_setting(requirement: Requirement, edits: Mapping[str, Any], trainer: st
 
 
 def _flown(
-    requirement: Requirement, family: Task, policy: Policy, setting: dict[str, float], record: Path, turn: int
+    requirement: Requirement, family: Task, policy: Policy, record: Path, constraints: tuple[str, ...]
 ) -> DialStart:
-    """One setting, flown on the training set."""
-    task, fixed = family.at(setting), policy.at(setting).fixed()
-    words = ", ".join(f"{name}={value:g}" for name, value in setting.items())
-    fixed = dataclasses.replace(fixed, about={**fixed.about, "dial": words, "task_toml": write_task(task)})
-    judgement = fly_for(requirement, fixed, task, TRAINING_SEED, TRAINING_TRIALS)
+    """The policy at its setting, flown on the training set."""
+    fixed, task = fixed_policy(policy, family), family.at(policy.setting)
+    flights = flights_for(requirement, fixed, task, TRAINING_SEED, TRAINING_TRIALS)
+    judgement = judge(flights)
     return DialStart(
-        setting=setting,
+        setting=policy.setting,
         task=task,
         policy=fixed,
         record=record,
+        flights=flights,
         judgement=judgement,
-        response=requirement.measure(judgement),
-        flights=turn,
+        response=requirement.measure(judgement, constraints=constraints),
     )

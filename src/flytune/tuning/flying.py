@@ -6,6 +6,7 @@ import jax.numpy as jnp
 
 from flytune.config.pytree import pytree
 from flytune.control.policy import Policy
+from flytune.evaluation.flights import Flights
 from flytune.evaluation.fly import fly
 from flytune.evaluation.judge import Judgement, judge
 from flytune.task.task import Task
@@ -25,6 +26,16 @@ class HoverThrust:
         return memory, jnp.zeros(4)
 
 
+def hover_flights(task: Task, seed: int, trials: int) -> Flights:
+    """Short flights without a controller, of which only the initial conditions count."""
+    return fly(HoverThrust(), task, trials=trials, seed=seed, duration=0.6)
+
+
+def flights_for(requirement: Requirement, policy: Policy, task: Task, seed: int, trials: int) -> Flights:
+    """The flights of a policy on trials that are long enough for the requirement."""
+    return fly(policy, task, trials=trials, seed=seed, duration=requirement.trial_duration())
+
+
 def fly_for(requirement: Requirement, policy: Policy, task: Task, seed: int, trials: int) -> Judgement:
-    """The judgement of a policy on trials that are long enough for the requirement."""
-    return judge(fly(policy, task, trials=trials, seed=seed, duration=requirement.trial_duration()))
+    """The judgement of these flights."""
+    return judge(flights_for(requirement, policy, task, seed, trials))

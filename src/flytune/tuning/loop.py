@@ -22,7 +22,7 @@ from flytune.tuning.choose import choose
 from flytune.tuning.flying import fly_for
 from flytune.tuning.history import VALIDATION_SEED, VALIDATION_TRIALS, History
 from flytune.tuning.iteration import Edit, Iteration, Validation
-from flytune.tuning.requirement import Requirement, ResponseSummary
+from flytune.tuning.requirement import Requirement, ResponseSummary, constraints_of
 from flytune.tuning.result import Tuning
 from flytune.tuning.rules import Rule, edited, to_dicts
 from flytune.tuning.sensitivity import load_sensitivities
@@ -59,11 +59,7 @@ class Tuner:
         self.sensitivities = load_sensitivities()
         self.start = find_start(self.requirement, self.task, self.edits, self.trainer)
         self.tables = document.plain(self.start.task)
-        self.constraints = tuple(
-            name
-            for name in self.start.task.termination
-            if any(f"{path}.".startswith(f"termination.{name}.") or path == "termination" for path in self.edits)
-        )
+        self.constraints = constraints_of(self.start.task, self.edits)
         self.history = History(
             self.out,
             asked={
@@ -173,8 +169,7 @@ class Tuner:
         """The result of an iteration on a validation set of its own."""
         seed = VALIDATION_SEED + len(self.history.validations)
         policy, task = self._policy(iteration.number), self.task_of(iteration)
-        duration = self.requirement.trial_duration()
-        flown = evaluate(policy, task, name=str(self.out), trials=VALIDATION_TRIALS, seed=seed, duration=duration)
+        flown = evaluate(policy, task, name=str(self.out), trials=VALIDATION_TRIALS, seed=seed, duration=self.duration)
         self.validated[iteration.number], judgement = flown, flown.judgement
         response = self._response(judgement)
         validation = Validation(

@@ -2,7 +2,7 @@
 
 import dataclasses
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from typing import Any
 
 import numpy as np
@@ -11,6 +11,7 @@ from flytune.errors import BadInput
 from flytune.evaluation.judge import Judgement
 from flytune.evaluation.metrics import POSITION_BAND, YAW_BAND
 from flytune.evaluation.statistics import quantile
+from flytune.task.task import Task
 
 AXES = ("position", "x", "y", "z", "yaw")
 LONGEST = 60.0  # s
@@ -148,6 +149,15 @@ class Requirement:
             f"{self.axis} settles in {time} ({name}), overshoot at most {100 * self.overshoot:g} %, "
             f"error at most {error} (both in the median), {100 * self.settled:g} % of the trials settle"
         )
+
+
+def constraints_of(task: Task, edits: Collection[str]) -> tuple[str, ...]:
+    """The names of the terminations of a task that the user has set, whole or in part."""
+    return tuple(
+        name
+        for name in task.termination
+        if any(f"{path}.".startswith(f"termination.{name}.") or path == "termination" for path in edits)
+    )
 
 
 def make_requirement(

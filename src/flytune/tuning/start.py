@@ -9,14 +9,13 @@ from typing import Any
 from flytune.config import document
 from flytune.control.policy import Policy, load_policy
 from flytune.errors import BadInput
-from flytune.evaluation.fly import fly
 from flytune.evaluation.judge import Judgement
 from flytune.runs.shipped import shipped_files, shipped_name, shipped_names
 from flytune.task.task import Task, load_task
 from flytune.training.trainer import find_trainer
 from flytune.tuning.dial_start import DIAL, find_setting
 from flytune.tuning.feasibility import check_feasible
-from flytune.tuning.flying import HoverThrust, fly_for
+from flytune.tuning.flying import fly_for, hover_flights
 from flytune.tuning.history import TRAINING_SEED, TRAINING_TRIALS
 from flytune.tuning.requirement import Requirement, ResponseSummary
 from flytune.tuning.rules import edited, is_fixed
@@ -64,12 +63,11 @@ def find_start(requirement: Requirement, wanted: str | None, edits: Mapping[str,
     times: dict[str, float] = {}
     if dialled is not None:
         tasks[DIAL], times[DIAL] = dialled.task, _time(dialled.response)
-    if dialled is None or requirement.misses(dialled.response):  # else it is possible, and no other has to be flown
-        known_tasks = {wanted: load_task(wanted, dict(edits))} if wanted else _known_tasks(edits)
-        first = next(iter(known_tasks.values()))
-        flights = fly(HoverThrust(), first, trials=TRAINING_TRIALS, seed=TRAINING_SEED, duration=0.6)
-        check_feasible(first, requirement, flights, tuple(edits))
-        tasks |= known_tasks
+    if dialled is None or requirement.misses(dialled.response):  # else no other has to be flown
+        tasks |= {wanted: load_task(wanted, dict(edits))} if wanted else _known_tasks(edits, needed=dialled is None)
+    first = next(iter(tasks.values()))
+    flights = dialled.flights if dialled is not None else hover_flights(first, TRAINING_SEED, TRAINING_TRIALS)
+    check_feasible(first, requirement, flights, tuple(edits))
     name = WITHOUT_POLICY if WITHOUT_POLICY in tasks else next(iter(tasks))
     policy = record = judgement = None
     smallest = math.inf
@@ -124,8 +122,8 @@ def _prepared(task: Task, requirement: Requirement, trainer: str, warm_start: bo
     return edited(document.plain(task), values, {path: reason for path, (_, reason) in free.items()})
 
 
-def _known_tasks(edits: Mapping[str, Any]) -> dict[str, Task]:
-    """The known tasks that have all fields the user has set."""
+def _known_tasks(edits: Mapping[str, Any], *, needed: bool) -> dict[str, Task]:
+    """The known tasks that have all fields the user has set; where one is needed, there is at least one."""
     found: dict[str, Task] = {}
     refused: list[BadInput] = []
     for name in KNOWN:
@@ -133,7 +131,7 @@ def _known_tasks(edits: Mapping[str, Any]) -> dict[str, Task]:
             found[name] = load_task(name, dict(edits))
         except BadInput as error:
             refused.append(error)
-    if not found:
+    if needed and not found:
         raise refused[0]
     return found
 

@@ -78,7 +78,7 @@ class OnnxController:
     setting: dict[str, Any] = dataclasses.field(default_factory=dict)  # dial -> its value
     about: dict[str, str] = label(default_factory=dict)  # the metadata of the file: task, vehicle, ...
 
-    def at(self, setting: Setting | None = None, /, **values: float) -> "OnnxController":
+    def at(self, setting: Setting | None = None, /, **values: Any) -> "OnnxController":
         """The controller with its dials set; a dial that is not named keeps its value.
 
         Raises:
