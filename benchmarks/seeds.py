@@ -14,7 +14,7 @@ os.environ.setdefault("XLA_FLAGS", "--xla_cpu_multi_thread_eigen=false intra_op_
 
 import jax
 
-from flytune.task.task import load_task
+from flytune.task.files import load_task
 from flytune.training import ppo
 
 SEEDS, REPEATS = 5, 4

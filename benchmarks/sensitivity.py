@@ -42,7 +42,7 @@ DOCS = HERE / "docs" / "results" / "heuristics"
 def jobs(seeds: int) -> list[tuple[str | None, float | None, int]]:
     """Every training: parameter, value, seed; the unchanged task once per seed."""
     from flytune.config.writing import plain
-    from flytune.task.task import load_task
+    from flytune.task.files import load_task
     from flytune.tuning.rules import number_at
 
     tables = plain(load_task(BASE))
@@ -70,7 +70,7 @@ def measure_one(folder: Path, updates: int, job: tuple[str | None, float | None,
     from flytune.evaluation.fly import fly
     from flytune.evaluation.judge import AXES, judge
     from flytune.runs.shipped import shipped_files
-    from flytune.task.task import load_task
+    from flytune.task.files import load_task
     from flytune.training.loop import train
 
     parameter, value, seed = job
@@ -119,7 +119,7 @@ def measure(folder: Path, updates: int, seeds: int, workers: int) -> None:
             pool.starmap(measure_one, missing, chunksize=1)
 
     from flytune.config.writing import plain
-    from flytune.task.task import load_task
+    from flytune.task.files import load_task
     from flytune.tuning.rules import number_at
 
     tables = plain(load_task(BASE))

@@ -34,7 +34,7 @@ from flytune.simulation.actuator import Actuator
 from flytune.simulation.aerodynamics import ground_effect, rotor_drag
 from flytune.simulation.simulator import VehicleStates, to_inertial
 from flytune.simulation.simulators import make_simulator
-from flytune.task.task import load_task
+from flytune.task.files import load_task
 
 MANOEUVRES = {"moderate": (1.0, 0.05, 0.04, 0.06), "hard": (2.2, 0.37, 0.3, 0.1)}  # see integrator.manoeuvre
 LAGGING = (1.0, 0.3, 0.25, 0.15)  # for the vehicle whose motors lag

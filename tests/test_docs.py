@@ -54,7 +54,7 @@ def test_every_file_that_is_named_is_there(path):
 
 @pytest.mark.parametrize("block", each(r"```toml\n(.*?)```", re.DOTALL))
 def test_every_task_file_can_be_loaded(block, tmp_path):
-    from flytune.task.task import load_task
+    from flytune.task.files import load_task
 
     assert tomllib.loads(block)["based_on"]
     (tmp_path / "mine.toml").write_text(block, encoding="utf-8")

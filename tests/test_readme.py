@@ -60,7 +60,7 @@ def test_the_commands_of_the_readme_run_one_after_the_other(tmp_path):
 def test_the_commands_of_the_readme_that_need_stable_baselines3_run(tmp_path):
     stable_baselines3 = pytest.importorskip("stable_baselines3", reason="needs flytune[sb3]")
     from flytune.adapters.vec_env import HoverVecEnv
-    from flytune.task.task import load_task
+    from flytune.task.files import load_task
 
     model = stable_baselines3.PPO("MlpPolicy", HoverVecEnv(load_task("baseline"), 2), n_steps=8, batch_size=16)
     model.save(tmp_path / "model.zip")
@@ -72,7 +72,7 @@ def test_the_commands_of_the_readme_that_need_stable_baselines3_run(tmp_path):
 
 def test_every_edit_of_the_readme_changes_the_task():
     from flytune.config.document import parse_assignment
-    from flytune.task.task import load_task, write_task
+    from flytune.task.files import load_task, write_task
 
     typed = [shlex.split(command, comments=True) for command in COMMANDS if " --set " in command]
     edits = [word for words in typed for word in words if "=" in word]
@@ -91,7 +91,7 @@ def test_every_file_the_readme_links_to_is_there():
 def test_the_names_the_readme_lists_are_the_ones_that_ship():
     from flytune.control.classical import CLASSICAL
     from flytune.physics.vehicle import vehicle_names
-    from flytune.task.task import preset_names
+    from flytune.task.files import preset_names
     from flytune.training.trainer import TRAINERS
 
     extras = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]["optional-dependencies"]

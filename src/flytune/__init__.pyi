@@ -32,9 +32,9 @@ from .reproduction.reproduction import Reproduction as Reproduction
 from .reproduction.reproduction import reproduce as reproduce
 from .runs.find import FoundController as FoundController
 from .runs.find import find_controller as find_controller
+from .task.files import load_task as load_task
+from .task.files import write_task as write_task
 from .task.task import Task as Task
-from .task.task import load_task as load_task
-from .task.task import write_task as write_task
 from .training.loop import Run as Run
 from .training.loop import train as train
 from .tuning.result import Tuning as Tuning

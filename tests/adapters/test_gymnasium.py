@@ -19,7 +19,7 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv  # noqa: E402
 from flytune.adapters import registration  # noqa: E402
 from flytune.adapters.gymnasium import HoverEnv, HoverVectorEnv  # noqa: E402
 from flytune.errors import BadInput  # noqa: E402
-from flytune.task.task import load_task  # noqa: E402
+from flytune.task.files import load_task  # noqa: E402
 
 NUMBER = 6  # of every vector here and in test_batch: one compiled program serves them all
 ROOT = Path(__file__).parents[2]

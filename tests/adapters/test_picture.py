@@ -11,7 +11,7 @@ pytest.importorskip("PIL", reason="needs flytune[gymnasium]")
 from flytune.adapters import picture
 from flytune.adapters.picture import FINER, SIZE, TARGET, Scene, draw
 from flytune.simulation.simulator import VehicleStates
-from flytune.task.task import load_task
+from flytune.task.files import load_task
 
 PLACE = np.array([0.3, -0.2, 1.2])
 

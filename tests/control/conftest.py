@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from flytune.physics import dynamics, rotation
+from flytune.task.files import load_task
 from flytune.task.observation import observe
-from flytune.task.task import load_task
 
 
 @pytest.fixture(scope="session")

@@ -16,7 +16,7 @@ from flytune.control.controller import Controller
 from flytune.control.sensing import heading
 from flytune.errors import BadInput
 from flytune.physics.rotation import from_euler
-from flytune.task.task import load_task
+from flytune.task.files import load_task
 
 SETS = ("textbook", "tuned")
 EVERY = [(name, gains) for name in CLASSICAL for gains in SETS]

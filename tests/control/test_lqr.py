@@ -11,7 +11,7 @@ from flytune.control.classical import classical_controller, read_gains
 from flytune.control.lqr import feedback, linearised, weights
 from flytune.control.sensing import sense
 from flytune.physics.vehicle import load_vehicle, vehicle_names
-from flytune.task.task import load_task
+from flytune.task.files import load_task
 
 ROLL, PITCH = (-1, -1, 1, 1), (-1, 1, 1, -1)  # signs of R4
 H = 0.01

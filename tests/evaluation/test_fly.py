@@ -15,8 +15,8 @@ from flytune.control.controller import Controller
 from flytune.errors import BadInput, Diverged
 from flytune.evaluation.fly import fly
 from flytune.physics.dynamics import hovering
+from flytune.task.files import load_task
 from flytune.task.situation import situation
-from flytune.task.task import load_task
 from flytune.task.termination import margins
 
 

@@ -14,9 +14,9 @@ from flytune.evaluation.judge import judge
 from flytune.physics.dynamics import hovering
 from flytune.simulation.jax_simulator import JaxSimulator
 from flytune.simulation.simulators import make_simulator
+from flytune.task.files import load_task
 from flytune.task.initial_state import EVALUATION_INITIAL_STATES
 from flytune.task.situation import situation
-from flytune.task.task import load_task
 from flytune.task.termination import margins
 
 FIELDS = ("position", "attitude", "velocity", "body_rate", "rotor_speed_rpm", "action")

@@ -9,7 +9,7 @@ from flytune.control.classical import classical_controller
 from flytune.evaluation import lower_bounds
 from flytune.evaluation.fly import fly
 from flytune.evaluation.judge import judge
-from flytune.task.task import load_task
+from flytune.task.files import load_task
 
 
 def test_the_bound_is_the_way_to_the_edge_of_the_band_at_the_speed_bound():

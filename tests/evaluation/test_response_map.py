@@ -11,7 +11,7 @@ from flytune.control.response_map import ResponseMap, monotone, response_map
 from flytune.errors import BadInput
 from flytune.evaluation.measure_map import measure_map, with_maps
 from flytune.runs.find import find_controller
-from flytune.task.task import load_task
+from flytune.task.files import load_task
 
 FAMILY = load_task("dial")
 

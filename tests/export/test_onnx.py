@@ -15,8 +15,8 @@ from flytune.control.controller import Controller
 from flytune.control.policy import ACTION, Network, Policy, make_network
 from flytune.errors import BadInput
 from flytune.evaluation.fly import fly
+from flytune.task.files import load_task, preset_names, read_task_text, write_task
 from flytune.task.observation import LAYOUT, SIZE
-from flytune.task.task import load_task, preset_names, read_task_text, write_task
 
 onnx = pytest.importorskip("onnx", reason="needs flytune[onnx]")
 onnxruntime = pytest.importorskip("onnxruntime", reason="needs flytune[onnx]")

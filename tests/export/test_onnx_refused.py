@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from flytune.errors import BadInput
 from flytune.evaluation.fly import fly
-from flytune.task.task import load_task
+from flytune.task.files import load_task
 
 onnx = pytest.importorskip("onnx", reason="needs flytune[onnx]")
 pytest.importorskip("onnxruntime", reason="needs flytune[onnx]")

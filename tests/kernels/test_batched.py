@@ -16,7 +16,7 @@ from tests.layouts import LAYOUTS
 from flytune.kernels.batched import available, batched
 from flytune.physics.vehicle import load_vehicle, vehicle_names
 from flytune.simulation import environment
-from flytune.task.task import load_task, preset_names
+from flytune.task.files import load_task, preset_names
 
 pytestmark = pytest.mark.skipif(not available(), reason="no kernels on this machine")
 

@@ -16,7 +16,7 @@ def listen(event, seconds, **facts):
     if event == "/jax/core/compile/jaxpr_trace_duration" and name in ("start", "_part", "_descend"):
         traced.append(name)
 jax.monitoring.register_event_duration_secs_listener(listen)
-from flytune.task.task import load_task
+from flytune.task.files import load_task
 from flytune.training import apg
 task = load_task("baseline", json.loads(sys.argv[1]))
 EXTRA

@@ -13,7 +13,7 @@ from flytune.control.policy import make_network
 from flytune.kernels.batched import available
 from flytune.kernels.dense import Actor
 from flytune.simulation.rollout import Draw, reset_all, rollout
-from flytune.task.task import load_task
+from flytune.task.files import load_task
 
 pytestmark = pytest.mark.skipif(not available(), reason="no kernels on this machine")
 

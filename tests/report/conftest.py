@@ -11,8 +11,8 @@ from flytune.control.policy import Policy, make_network
 from flytune.evaluation.evaluate import Evaluation
 from flytune.evaluation.fly import fly
 from flytune.evaluation.judge import judge
+from flytune.task.files import load_task
 from flytune.task.observation import SIZE
-from flytune.task.task import load_task
 
 
 @pytest.fixture(scope="session")

@@ -8,7 +8,7 @@ from tests.pages import HOSTILE, Reader
 
 from flytune.errors import BadInput
 from flytune.report.report import write_report
-from flytune.task.task import write_task
+from flytune.task.files import write_task
 
 
 @pytest.fixture

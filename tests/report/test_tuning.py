@@ -12,7 +12,7 @@ from flytune.config.files import make_folder
 from flytune.evaluation.evaluate import evaluate
 from flytune.report.tuning import evaluate_best, requirement_table, write_tuning
 from flytune.runs.shipped import HOME
-from flytune.task.task import load_task, write_task
+from flytune.task.files import load_task, write_task
 
 
 def line(number, time, **changes):

@@ -5,7 +5,7 @@ import math
 import pytest
 
 from flytune.reproduction.learning import reward_at, smoothed_reward, steps_to_share, steps_to_survive
-from flytune.task.task import load_task
+from flytune.task.files import load_task
 
 
 def rows(rewards, lengths=None):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from flytune.reproduction.standstill import standstill_distance
-from flytune.task.task import load_task
+from flytune.task.files import load_task
 
 
 def horizontal(r):

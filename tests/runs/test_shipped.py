@@ -10,7 +10,7 @@ from flytune.control.policy import load_policy
 from flytune.evaluation.fly import fly
 from flytune.evaluation.judge import judge
 from flytune.runs.shipped import DEFAULT_TRAINER, shipped_files, shipped_name, shipped_names
-from flytune.task.task import load_task, preset_names, read_task_text
+from flytune.task.files import load_task, preset_names, read_task_text
 from flytune.training.trainer import TRAINERS, find_trainer, trainer_names
 
 REFINED = [name for name in preset_names() if name.endswith("-refined")]

@@ -9,7 +9,7 @@ import sys
 
 from flytune.adapters.vec_env import HoverVecEnv
 from flytune.benchmark import baselines
-from flytune.task.task import load_task
+from flytune.task.files import load_task
 
 
 def case(what, run=lambda: None, extras=()):

@@ -16,7 +16,7 @@ from stable_baselines3.common import buffers
 from stable_baselines3.common.callbacks import BaseCallback
 
 from flytune.control.policy import Network
-from flytune.task.task import load_task
+from flytune.task.files import load_task
 from flytune.training import ppo, sb3
 
 KEY = jax.random.key(3)

@@ -18,7 +18,7 @@ from flytune.control.policy import load_policy
 from flytune.errors import BadInput, Diverged
 from flytune.export.untrusted.sb3_model import actor_network
 from flytune.runs.directory import RunDirectory
-from flytune.task.task import load_task, write_task
+from flytune.task.files import load_task, write_task
 from flytune.training import sb3
 from flytune.training.loop import train
 from flytune.training.trainer import find_trainer
@@ -149,7 +149,7 @@ def test_a_missing_package_is_named_with_its_remedy_before_anything_is_written(t
         f"import sys; sys.modules[{package!r}] = None\n"
         "from flytune.errors import BadInput\n"
         "from flytune.training.loop import train\n"
-        "from flytune.task.task import load_task\n"
+        "from flytune.task.files import load_task\n"
         "from pathlib import Path\n"
         "try: train(load_task('baseline'), 'sb3', out=Path(sys.argv[1]))\n"
         "except BadInput as error: print(error)\n"

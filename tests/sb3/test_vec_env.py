@@ -15,7 +15,7 @@ from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import VecCheckNan, VecMonitor, VecNormalize
 
 from flytune.adapters.vec_env import HoverVecEnv
-from flytune.task.task import load_task
+from flytune.task.files import load_task
 
 NUMBER, HORIZON = 6, 12
 GENTLE = np.zeros((NUMBER, 4), np.float32)

@@ -13,7 +13,7 @@ from flytune.physics.dynamics import CONTROL_PERIOD
 from flytune.physics.vehicle import load_vehicle
 from flytune.simulation.simulator import VehicleStates, to_body, to_inertial
 from flytune.simulation.simulators import make_simulator
-from flytune.task.task import load_task
+from flytune.task.files import load_task
 
 SIMULATORS = ("pybullet", "mujoco")
 STATE = ("position", "attitude", "velocity", "body_rate")

@@ -12,10 +12,10 @@ import pytest
 from flytune.physics import dynamics
 from flytune.physics.vehicle import vehicle_names
 from flytune.simulation import environment
+from flytune.task.files import load_task, preset_names
 from flytune.task.observation import observe
 from flytune.task.reward import rewards
 from flytune.task.situation import situation
-from flytune.task.task import load_task, preset_names
 from flytune.task.termination import SAFE, causes, margins
 
 EVERY = list(itertools.product(preset_names(), vehicle_names()))

@@ -9,7 +9,7 @@ from flytune.errors import BadInput
 from flytune.simulation import environment
 from flytune.simulation.host import HostEnvironment, unravel
 from flytune.simulation.jax_simulator import JaxSimulator
-from flytune.task.task import load_task
+from flytune.task.files import load_task
 from flytune.task.termination import causes
 
 QUIET = {f"noise.{block}": 0.0 for block in ("position", "attitude", "velocity", "body_rate")}

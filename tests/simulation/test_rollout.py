@@ -11,7 +11,8 @@ import pytest
 from flytune.config.pytree import pytree
 from flytune.simulation.environment import hold
 from flytune.simulation.rollout import Draw, reset_all, rollout
-from flytune.task.task import Task, TaskFamily, load_task
+from flytune.task.files import load_task
+from flytune.task.task import Task, TaskFamily
 
 NUMBER, STEPS = 5, 30
 

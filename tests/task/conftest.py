@@ -3,8 +3,8 @@
 import jax.numpy as jnp
 import pytest
 
+from flytune.task.files import load_task, preset_names
 from flytune.task.situation import Situation
-from flytune.task.task import load_task, preset_names
 
 
 @pytest.fixture(scope="session")

@@ -13,7 +13,7 @@ from flytune.errors import BadInput
 from flytune.simulation import environment
 from flytune.simulation.rollout import reset_all
 from flytune.task.dial import Dial, Input, number_of_inputs, told
-from flytune.task.task import load_task, read_task_text, write_task
+from flytune.task.files import load_task, read_task_text, write_task
 from flytune.training.update import turned
 
 FAMILY = load_task("dial")

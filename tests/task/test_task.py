@@ -12,8 +12,8 @@ from flytune.config.document import source_of
 from flytune.config.nested import leaves
 from flytune.errors import BadInput
 from flytune.physics.vehicle import load_vehicle, vehicle_names
+from flytune.task.files import RENAMED, load_task, preset_names, read_task_text, write_task
 from flytune.task.reward import DualExponential, Exponential, Smoothness, Survival
-from flytune.task.task import RENAMED, load_task, preset_names, read_task_text, write_task
 
 PAPER_REWARDS = {
     "baseline": {  # R11

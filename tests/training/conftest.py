@@ -2,7 +2,7 @@
 
 import pytest
 
-from flytune.task.task import load_task
+from flytune.task.files import load_task
 
 SMALL_APG = {"apg.environments": 4, "apg.window": 10, "apg.updates": 4, "apg.hidden": [8, 8]}
 SMALL_PPO = {

@@ -14,8 +14,8 @@ from flytune.evaluation.fly import fly
 from flytune.evaluation.judge import judge
 from flytune.simulation import environment
 from flytune.simulation.rollout import Draw
+from flytune.task.files import load_task
 from flytune.task.observation import input_scale
-from flytune.task.task import load_task
 from flytune.training import apg
 
 
@@ -115,7 +115,7 @@ import dataclasses, hashlib, os, sys
 if sys.argv[1] == "one":
     os.sched_setaffinity(0, [min(os.sched_getaffinity(0))])
 import jax, numpy as np
-from flytune.task.task import load_task
+from flytune.task.files import load_task
 from flytune.training import apg
 task = load_task("baseline")
 settings = dataclasses.replace(task.apg, environments=6, window=20, hidden=(8, 8))

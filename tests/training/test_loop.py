@@ -10,7 +10,7 @@ import pytest
 from flytune.control.policy import load_policy
 from flytune.errors import BadInput, Diverged
 from flytune.runs.directory import CHECKPOINT, RunDirectory
-from flytune.task.task import load_task, write_task
+from flytune.task.files import load_task, write_task
 from flytune.training.loop import train
 from flytune.training.trainer import TRAINERS, find_trainer, trainer_names
 from flytune.training.update import metrics_row

@@ -13,7 +13,7 @@ import pytest
 from jax.flatten_util import ravel_pytree
 from scipy import stats
 
-from flytune.task.task import load_task
+from flytune.task.files import load_task
 from flytune.training import ppo
 
 
@@ -245,7 +245,7 @@ import hashlib, os, sys
 if sys.argv[1] == "one":
     os.sched_setaffinity(0, [min(os.sched_getaffinity(0))])
 import jax, numpy as np
-from flytune.task.task import load_task
+from flytune.task.files import load_task
 from flytune.training import ppo
 settings = {"ppo.environments": 6, "ppo.rollout": 32, "ppo.minibatch": 24, "ppo.epochs": 3, "ppo.hidden": [16, 16]}
 task = load_task("baseline", settings)

@@ -7,7 +7,7 @@ import math
 import pytest
 
 from flytune.config import document, nested
-from flytune.task.task import load_task
+from flytune.task.files import load_task
 from flytune.tuning.choose import choose
 from flytune.tuning.iteration import HALF_WAY, Iteration
 from flytune.tuning.requirement import ResponseSummary, make_requirement

@@ -5,7 +5,7 @@ import pytest
 from flytune.control.classical import classical_controller
 from flytune.errors import BadInput
 from flytune.evaluation.fly import fly
-from flytune.task.task import load_task
+from flytune.task.files import load_task
 from flytune.tuning.feasibility import check_feasible
 from flytune.tuning.requirement import make_requirement
 

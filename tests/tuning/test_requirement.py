@@ -9,7 +9,7 @@ import pytest
 from flytune.errors import BadInput
 from flytune.evaluation.fly import fly
 from flytune.evaluation.judge import judge
-from flytune.task.task import load_task
+from flytune.task.files import load_task
 from flytune.tuning.requirement import ResponseSummary, make_requirement
 
 GOOD = ResponseSummary(settling_time=2.5, overshoot=0.0, error=0.001, settled=1.0, constraints_satisfied=1.0)

@@ -7,7 +7,7 @@ import pytest
 
 from flytune.config import document
 from flytune.errors import BadInput
-from flytune.task.task import load_task
+from flytune.task.files import load_task
 from flytune.tuning.rules import apply_rule, is_fixed, load_rules, number_at, rules_table, symptoms
 
 RULES = load_rules()

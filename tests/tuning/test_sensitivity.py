@@ -6,7 +6,7 @@ import math
 import pytest
 
 from flytune.config import document
-from flytune.task.task import load_task
+from flytune.task.files import load_task
 from flytune.tuning.rules import number_at
 from flytune.tuning.sensitivity import Curve, Point, SeedResult, Sensitivities, load_sensitivities
 

@@ -5,7 +5,7 @@ import math
 import pytest
 
 from flytune.errors import BadInput
-from flytune.task.task import load_task
+from flytune.task.files import load_task
 from flytune.tuning.requirement import make_requirement
 from flytune.tuning.start import find_start
 

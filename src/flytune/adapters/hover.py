@@ -10,8 +10,9 @@ from flytune.errors import BadInput, require
 from flytune.physics.dynamics import CONTROL_PERIOD
 from flytune.simulation.host import HostEnvironment
 from flytune.simulation.simulator import VehicleStates
+from flytune.task.files import load_task
 from flytune.task.observation import SIZE
-from flytune.task.task import Task, load_task
+from flytune.task.task import Task
 
 if TYPE_CHECKING:
     import gymnasium

@@ -16,8 +16,9 @@ from flytune.benchmark.requirement import TimeToRequirement, time_to_requirement
 from flytune.errors import BadInput
 from flytune.simulation.environment import Episode
 from flytune.simulation.rollout import Draw, reset_all, rollout
+from flytune.task.files import load_task
 from flytune.task.observation import SIZE
-from flytune.task.task import Task, load_task
+from flytune.task.task import Task
 from flytune.task.training_settings import PpoSettings, TrainerSettings
 from flytune.training.trainer import TRAINERS, Trainer
 

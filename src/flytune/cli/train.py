@@ -35,7 +35,7 @@ def train(
     from flytune.evaluation.evaluate import evaluate, write_evaluation
     from flytune.evaluation.measure_map import with_maps
     from flytune.runs.directory import new_directory
-    from flytune.task.task import load_task
+    from flytune.task.files import load_task
     from flytune.training.loop import train
     from flytune.training.progress import show_progress
 

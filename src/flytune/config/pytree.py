@@ -1,6 +1,7 @@
 """Frozen dataclasses that are JAX pytrees: numbers are leaves, structure is static, labels are left out."""
 
 import dataclasses
+from collections.abc import Mapping
 from typing import Any, TypeVar, dataclass_transform
 
 import jax
@@ -35,3 +36,19 @@ def pytree(cls: type[T]) -> type[T]:
     labels = [field.name for field in fields if field.metadata.get("label")]
     numbers = [field.name for field in fields if field.name not in structure and field.name not in labels]
     return jax.tree_util.register_dataclass(made, data_fields=numbers, meta_fields=structure, drop_fields=labels)
+
+
+def with_field(node: Any, path: tuple[str, ...], value: Any) -> Any:
+    """The dataclass or dict with the field at a path replaced.
+
+    Raises:
+        KeyError: there is no such field.
+    """
+    if not path:
+        return value
+    name, *rest = path
+    if isinstance(node, Mapping):
+        return {**node, name: with_field(node[name], tuple(rest), value)}
+    if not dataclasses.is_dataclass(node) or name not in {field.name for field in dataclasses.fields(node)}:
+        raise KeyError(name)
+    return dataclasses.replace(node, **{name: with_field(getattr(node, name), tuple(rest), value)})  # pyright: ignore

@@ -12,7 +12,8 @@ from flytune.evaluation.flights import Flights
 from flytune.evaluation.fly import fly
 from flytune.evaluation.judge import Judgement, judge
 from flytune.runs.find import FoundController, find_controller
-from flytune.task.task import Task, load_task
+from flytune.task.files import load_task
+from flytune.task.task import Task
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)

@@ -68,28 +68,12 @@ def fly(
         controller, name = controller.controller, name or controller.name
     family, task = task, task.at({name: values[0] for name, values in settings_along(controller, task, 1).items()})
     duration = task.duration if duration is None else duration
-    if not 1 <= trials <= 100_000:
-        raise BadInput(f"trials: {trials} is not allowed. Allowed: a whole number, 1 to 100000.")
-    if not (np.isfinite(duration) and 0.5 < duration <= 3600):
-        raise BadInput(f"duration: {duration} is not allowed. Allowed: above 0.5 to 3600 s.")
-    if initial_conditions not in EVALUATION_INITIAL_STATES:
-        raise BadInput(
-            f"starts: {initial_conditions!r} is not allowed. Allowed: {', '.join(EVALUATION_INITIAL_STATES)}."
-        )
-    if not 0 <= seed < 2**32:
-        raise BadInput(f"seed: {seed} is not allowed. Allowed: a whole number, 0 to {2**32 - 1}.")
+    _check_arguments(trials, seed, initial_conditions, duration)
     _check_controller(controller)
     steps = round(duration / CONTROL_PERIOD)
     initial_state = EVALUATION_INITIAL_STATES[initial_conditions]
     starts, noise_keys = _begin(task, initial_state, trial_keys(seed, trials))
-    if isinstance(simulator, str):
-        simulator_name, made = simulator, make_simulator(simulator, task.vehicle, trials, simulator_options)
-    else:
-        if simulator_options:
-            raise BadInput(
-                "simulator_options: are not allowed with a simulator of your own. Give them to its function."
-            )
-        simulator_name, made = getattr(simulator, "__name__", "custom"), simulator(task.vehicle, trials)
+    simulator_name, made = _made(simulator, task.vehicle, trials, simulator_options)
     try:
         record = rollout_trials(made, controller, task, starts, noise_keys, steps, name)
     finally:
@@ -114,6 +98,42 @@ def fly(
         initial_conditions=initial_conditions,
         dial=shown_setting(controller),
     )
+
+
+def _made(
+    simulator: str | Callable[[Vehicle, int], Simulator],
+    vehicle: Vehicle,
+    trials: int,
+    options: Mapping[str, Any] | None,
+) -> tuple[str, Simulator]:
+    """The name of a simulator, and the simulator for so many vehicles.
+
+    Raises:
+        BadInput: it is unknown or not installed, or options are given to one of the user's own.
+    """
+    if isinstance(simulator, str):
+        return simulator, make_simulator(simulator, vehicle, trials, options)
+    if options:
+        raise BadInput("simulator_options: are not allowed with a simulator of your own. Give them to its function.")
+    return getattr(simulator, "__name__", "custom"), simulator(vehicle, trials)
+
+
+def _check_arguments(trials: int, seed: int, initial_conditions: str, duration: float) -> None:
+    """Refuse what is out of range.
+
+    Raises:
+        BadInput: the argument, and what is allowed.
+    """
+    if not 1 <= trials <= 100_000:
+        raise BadInput(f"trials: {trials} is not allowed. Allowed: a whole number, 1 to 100000.")
+    if not (np.isfinite(duration) and 0.5 < duration <= 3600):
+        raise BadInput(f"duration: {duration} is not allowed. Allowed: above 0.5 to 3600 s.")
+    if initial_conditions not in EVALUATION_INITIAL_STATES:
+        raise BadInput(
+            f"starts: {initial_conditions!r} is not allowed. Allowed: {', '.join(EVALUATION_INITIAL_STATES)}."
+        )
+    if not 0 <= seed < 2**32:
+        raise BadInput(f"seed: {seed} is not allowed. Allowed: a whole number, 0 to {2**32 - 1}.")
 
 
 def _check_controller(controller: Any) -> None:

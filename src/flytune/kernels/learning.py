@@ -14,9 +14,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from flytune.kernels.dense import Writer, backward_function, forward_function, parameters_of
+from flytune.kernels.dense import backward_function, forward_function, parameters_of
 from flytune.kernels.exchange import exchange_functions, two_threads
 from flytune.kernels.native import architecture, loop, module, register
+from flytune.kernels.writer import Writer
 
 MOMENTS = 3  # numbers that the optimiser keeps and changes for each parameter: itself and two means
 ALIGNED = 16  # numbers in a line of the cache

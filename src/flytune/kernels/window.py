@@ -16,8 +16,9 @@ from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, Float, UInt32
 
 from flytune.kernels.batched import Kernel, Prepared, words
-from flytune.kernels.dense import Actor, Writer, backward_function, forward_function, parameters_of
+from flytune.kernels.dense import Actor, backward_function, forward_function, parameters_of
 from flytune.kernels.native import loop, module, register
+from flytune.kernels.writer import Writer
 
 
 def window(

@@ -12,7 +12,8 @@ from flytune.evaluation.judge import AXES, Judgement
 from flytune.evaluation.statistics import median
 from flytune.report.style import listed
 from flytune.tables import NULL, Column, Table, number
-from flytune.task.task import Task, write_task
+from flytune.task.files import write_task
+from flytune.task.task import Task
 
 COMMENT = re.compile(r"""^((?:"(?:\\.|[^"\\])*"|'[^']*'|[^"'#])*)(#.*)$""")  # a # inside quotes begins no comment
 

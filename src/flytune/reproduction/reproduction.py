@@ -15,9 +15,10 @@ from flytune.reproduction.figures import draw_figures
 from flytune.reproduction.inconsistencies import Inconsistency, find_inconsistencies
 from flytune.reproduction.page import html, markdown, summary, verdict_table
 from flytune.reproduction.study import Study, Training, open_study
-from flytune.reproduction.trainings import free_cores, train_all
+from flytune.reproduction.trainings import train_all
 from flytune.reproduction.verdict import JudgedClaim
 from flytune.training.loop import Progress
+from flytune.training.threads import free_cores
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -14,7 +14,8 @@ from flytune.config.nested import first_difference
 from flytune.control.policy import load_policy
 from flytune.errors import BadInput
 from flytune.runs.directory import has_checkpoint, read_facts
-from flytune.task.task import Task, load_task
+from flytune.task.files import load_task
+from flytune.task.task import Task
 from flytune.training.trainer import find_trainer
 
 BEHAVIOURS = ("baseline", "acrobatic", "inspection")  # of the paper

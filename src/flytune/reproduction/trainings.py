@@ -15,18 +15,11 @@ from typing import Any
 from flytune.config.files import write_text
 from flytune.errors import BadInput, Diverged, Interrupted
 from flytune.reproduction.study import BEHAVIOURS, Study, Training, training_status
-from flytune.task.task import write_task
+from flytune.task.files import write_task
 from flytune.training.loop import Progress
-from flytune.training.update import CORES, cores
+from flytune.training.threads import CORES, cores, free_cores
 
 ATTEMPTS = 3  # of one training whose process was killed
-
-
-def free_cores() -> int:
-    """How many cores this process may use."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
 
 
 def train_all(

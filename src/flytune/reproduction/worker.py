@@ -17,7 +17,7 @@ INTERVAL = 0.5  # s between two lines of progress
 
 def main(order: str) -> int:
     """The exit code of one training: 0 done, 2 bad input, 3 diverged, 130 interrupted."""
-    from flytune.task.task import load_task
+    from flytune.task.files import load_task
     from flytune.training.loop import Progress, train
 
     options = json.loads(order)

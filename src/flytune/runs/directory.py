@@ -20,7 +20,8 @@ from flytune.config import document, nested
 from flytune.config.files import make_folder, write_bytes, write_json, write_text
 from flytune.control.policy import Policy, save_policy
 from flytune.errors import BadInput
-from flytune.task.task import Task, load_task, write_task
+from flytune.task.files import load_task, write_task
+from flytune.task.task import Task
 
 CHECKPOINT = Path("checkpoint") / "train_state.safetensors"  # in a run directory
 

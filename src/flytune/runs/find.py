@@ -21,7 +21,8 @@ from flytune.export.untrusted.sb3_model import load_sb3
 from flytune.runs.directory import has_checkpoint, read_facts, resume_command
 from flytune.runs.shipped import shipped_files, shipped_names
 from flytune.task.dial import as_number
-from flytune.task.task import Task, load_task, read_task_text, write_task
+from flytune.task.files import load_task, read_task_text, write_task
+from flytune.task.task import Task
 
 SETTLING_TIME = "settling_time"
 READERS = {".safetensors": load_policy, ".onnx": load_onnx, ".zip": load_sb3}

@@ -1,6 +1,5 @@
 """Dials: numbers that a controller is told, and that fields of its task follow. One policy then has many responses."""
 
-import dataclasses
 import math
 from collections.abc import Mapping
 from typing import Annotated, Any, Literal, TypeVar
@@ -148,19 +147,3 @@ def as_number(value: Any) -> float | None:
     """A number of Python, NumPy or JAX as a float; None of anything else, also of text, a truth value and an array."""
     kind = getattr(getattr(value, "dtype", None), "kind", "f" if type(value) in (int, float) else "")
     return float(value) if kind in ("f", "i", "u") and np.ndim(value) == 0 else None
-
-
-def with_field(node: Any, path: tuple[str, ...], value: Any) -> Any:
-    """The dataclass or dict with the field at a path replaced.
-
-    Raises:
-        KeyError: there is no such field.
-    """
-    if not path:
-        return value
-    name, *rest = path
-    if isinstance(node, Mapping):
-        return {**node, name: with_field(node[name], tuple(rest), value)}
-    if not dataclasses.is_dataclass(node) or name not in {field.name for field in dataclasses.fields(node)}:
-        raise KeyError(name)
-    return dataclasses.replace(node, **{name: with_field(getattr(node, name), tuple(rest), value)})  # pyright: ignore

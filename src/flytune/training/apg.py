@@ -25,11 +25,10 @@ from flytune.simulation.rollout import Draw, reset_all, rollout, split_keys
 from flytune.task.observation import SIZE, input_scale
 from flytune.task.task import Task
 from flytune.task.training_settings import ApgSettings
+from flytune.training.threads import PARTS, in_threads
 from flytune.training.update import (
-    PARTS,
     averaged,
     descend,
-    in_threads,
     metrics_of,
     network_scale,
     rollout_sums,

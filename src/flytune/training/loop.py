@@ -15,7 +15,8 @@ import jax
 from flytune.control.policy import Policy
 from flytune.errors import BadInput, Interrupted, require
 from flytune.runs.directory import RunDirectory, resume_command
-from flytune.task.task import Task, write_task
+from flytune.task.files import write_task
+from flytune.task.task import Task
 from flytune.training.progress import Clock, Progress
 from flytune.training.tensorboard import EventLog
 from flytune.training.trainer import DEFAULT_TRAINER, find_trainer

@@ -30,12 +30,10 @@ from flytune.task.task import Task
 from flytune.task.training_settings import PpoSettings
 from flytune.training.epochs import B1, B2, EPS, learn_in_threads
 from flytune.training.surrogate import entropy, learning_rate, log_probability, spread, surrogate
+from flytune.training.threads import PARTS, BusyCores, in_threads
 from flytune.training.update import (
-    PARTS,
-    BusyCores,
     averaged,
     descend,
-    in_threads,
     metrics_of,
     network_scale,
     rollout_sums,

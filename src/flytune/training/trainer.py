@@ -83,7 +83,7 @@ class Trainer:
 
     def start(self, task: Task, key: Array) -> Any:
         """The training state before the first update."""
-        from flytune.training.update import keep_freed_memory
+        from flytune.training.threads import keep_freed_memory
 
         keep_freed_memory()
         return self._algorithm().start(task, self.settings(task), key)
@@ -190,8 +190,11 @@ def find_trainer(name: str, *, every_task: bool = False) -> Trainer:
     """The trainer of a name.
 
     Raises:
-        BadInput: there is none, or it cannot train every task where that is needed.
+        BadInput: there is none, it cannot train every task where that is needed, or `FLYTUNE_CORES` is not a number.
     """
+    from flytune.training.threads import cores
+
+    cores()  # refused here, before anything is written
     names = trainer_names(every_task=every_task)
     if name not in names:
         raise BadInput(f"trainer: {name!r} is not allowed. Allowed: {', '.join(names)}.")

@@ -1,21 +1,14 @@
 """The parts of an update that trainers share: the optimiser step, the average of the weights, and the metrics."""
 
-import ctypes
 import dataclasses
 import math
-import os
-import sys
-import time
-from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from functools import lru_cache
+from collections.abc import Sequence
 from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
-from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from flytune.errors import Diverged
@@ -26,79 +19,6 @@ from flytune.task.task import Task
 from flytune.task.termination import causes
 
 T = TypeVar("T")
-
-PARTS = 2  # of a batch, which two cores can compute at the same time
-CORES = "FLYTUNE_CORES"  # in the environment: how many cores a training may use at most
-
-# parameters of glibc's mallopt: the size from which a block is mapped by itself, the free memory that is given back,
-# and the number of arenas; all but the first arena map blocks of 64 MB and more by themselves
-MMAP_THRESHOLD, TRIM_THRESHOLD, ARENA_MAX = -3, -1, -8
-
-
-def keep_freed_memory() -> None:
-    """Let this process keep the memory that it frees, where the C library is glibc.
-
-    An update allocates and frees tens of megabytes. Otherwise the operating system takes the memory back each time, and
-    clears every page before it gives it out again: half of the time of an update.
-    """
-    mallopt = getattr(ctypes.CDLL(None), "mallopt", None) if sys.platform == "linux" else None
-    if mallopt is not None:
-        mallopt(MMAP_THRESHOLD, 2**30)
-        mallopt(TRIM_THRESHOLD, 2**31 - 1)
-        mallopt(ARENA_MAX, 1)
-
-
-def cores() -> int:
-    """The number of processor cores that a training may use: those of this process, or fewer by `FLYTUNE_CORES`."""
-    free = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    wanted = os.environ.get(CORES, "")
-    return min(free, max(1, int(wanted))) if wanted.isdigit() else free
-
-
-def in_threads(part: Callable[[int], T], number: int, tracer: Any) -> tuple[T, ...]:
-    """`part` of 0, 1, ... of at most `PARTS` parts: at the same time where a training may use two cores.
-
-    Args:
-        part: of an index; it calls a program.
-        number: of parts.
-        tracer: an array of the caller, by which a trace is known; a thread of its own would not know of it.
-    """
-    if isinstance(tracer, Tracer):
-        return tuple(map(part, range(number)))
-
-    def finished(index: int) -> T:
-        return jax.block_until_ready(part(index))
-
-    return tuple((_threads().map if cores() > 1 else map)(finished, range(number)))
-
-
-@lru_cache
-def _threads() -> ThreadPoolExecutor:
-    return ThreadPoolExecutor(PARTS, "flytune-part")
-
-
-class BusyCores:
-    """How many threads work on one problem together, which pays only where both find a core of their own at once.
-
-    Beside other load, two threads that wait for each other are slower than one. Then one works, and two try again
-    after some updates.
-    """
-
-    FREE, PAUSE = 1.6, 15  # seconds of processor per second that show free cores; updates in one thread after fewer
-
-    def __init__(self) -> None:
-        self._pause = 0
-
-    def run(self, work: Callable[[int], T]) -> T:
-        """`work` of a number of threads, 1 or 2; its result does not depend on it."""
-        if cores() == 1 or self._pause:
-            self._pause = max(0, self._pause - 1)
-            return work(1)
-        wall, processor = time.perf_counter(), time.process_time()
-        result = jax.block_until_ready(work(PARTS))
-        if time.process_time() - processor < self.FREE * (time.perf_counter() - wall):
-            self._pause = self.PAUSE
-        return result
 
 
 def network_scale(task: Task, factors: Sequence[float]) -> Float[Array, "inputs"]:

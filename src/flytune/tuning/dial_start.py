@@ -13,7 +13,8 @@ from flytune.evaluation.flights import Flights
 from flytune.evaluation.judge import Judgement, judge
 from flytune.runs.find import fixed_policy
 from flytune.runs.shipped import shipped_files, shipped_name, shipped_names
-from flytune.task.task import Task, load_task
+from flytune.task.files import load_task
+from flytune.task.task import Task
 from flytune.tuning.flying import flights_for
 from flytune.tuning.history import TRAINING_SEED, TRAINING_TRIALS
 from flytune.tuning.requirement import Requirement, ResponseSummary, constraints_of

@@ -14,7 +14,8 @@ from flytune.errors import Diverged
 from flytune.evaluation.evaluate import Evaluation, evaluate
 from flytune.evaluation.judge import Judgement
 from flytune.runs.directory import has_checkpoint
-from flytune.task.task import Task, load_task, write_task
+from flytune.task.files import load_task, write_task
+from flytune.task.task import Task
 from flytune.training.progress import Progress
 from flytune.training.trainer import find_trainer
 from flytune.tuning import messages

@@ -11,7 +11,8 @@ from flytune.control.policy import Policy, load_policy
 from flytune.errors import BadInput
 from flytune.evaluation.judge import Judgement
 from flytune.runs.shipped import shipped_files, shipped_name, shipped_names
-from flytune.task.task import Task, load_task
+from flytune.task.files import load_task
+from flytune.task.task import Task
 from flytune.training.trainer import find_trainer
 from flytune.tuning.dial_start import DIAL, find_setting
 from flytune.tuning.feasibility import check_feasible

@@ -5,7 +5,8 @@ import time
 
 import pytest
 
-from flytune.training.update import BusyCores, cores, in_threads
+from flytune.cli.main import main
+from flytune.training.threads import BusyCores, cores, in_threads
 
 
 def threads_of(busy, number, work=lambda threads: None):
@@ -35,11 +36,25 @@ def test_two_threads_go_on_while_both_have_a_core(monkeypatch):
     assert threads_of(BusyCores(), 4) == [2] * 4
 
 
-@pytest.mark.parametrize(("wanted", "found"), [("1", 1), ("0", 1), ("1000", None), ("", None), ("many", None)])
+@pytest.mark.parametrize(("wanted", "found"), [("1", 1), (" 1 ", 1), ("1000", None), ("", None), (" ", None)])
 def test_the_environment_lowers_the_number_of_cores_and_never_raises_it(monkeypatch, wanted, found):
     free = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     monkeypatch.setenv("FLYTUNE_CORES", wanted)
     assert cores() == (found or free)
+
+
+@pytest.mark.parametrize("wanted", ["0", "-1", "two", "1.5", "²", "1e3"])
+@pytest.mark.parametrize("command", [["train", "baseline"], ["tune", "--settling-time", "3"], ["reproduce"]])
+def test_a_number_of_cores_that_is_none_is_refused_before_anything_is_written(
+    monkeypatch, tmp_path, capsys, wanted, command
+):
+    monkeypatch.setenv("FLYTUNE_CORES", wanted)
+    out = tmp_path / "out"
+    assert main([*command, "--out", str(out)]) == 2
+    assert capsys.readouterr().err == (
+        f"FLYTUNE_CORES: {wanted!r} is not allowed. Allowed: a whole number, 1 or more. Set another, or unset it.\n"
+    )
+    assert not out.exists()
 
 
 def test_a_failure_in_one_part_is_the_callers():
