@@ -11,7 +11,7 @@ Each command of the command line is one call here:
 - train: `train`; evaluate: `evaluate`, or `find_controller`, `fly` and `judge` one by one
 - compare, report: `evaluate_all`, then `compare` of the judgements, and `write_report`
 - tune, rules: `tune`, `load_rules`; reproduce: `reproduce`; bench: `bench`
-- export: `export_policy`, or `save_onnx` and `save_policy`; show: `load_task`, `write_task`
+- export: `export_policy`, or `save_onnx` and `save_policy`; list: `catalogue`; show: `load_task`, `write_task`
 
 JAX is imported with the first name that needs it, not with the package.
 """

@@ -30,6 +30,7 @@ from .physics.vehicle import load_vehicle as load_vehicle
 from .report.report import write_report as write_report
 from .reproduction.reproduction import Reproduction as Reproduction
 from .reproduction.reproduction import reproduce as reproduce
+from .runs.catalogue import catalogue as catalogue
 from .runs.find import FoundController as FoundController
 from .runs.find import find_controller as find_controller
 from .task.files import load_task as load_task

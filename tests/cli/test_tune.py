@@ -38,7 +38,10 @@ def test_bad_input_is_one_line_and_leaves_nothing(tmp_path, monkeypatch, capsys,
 
 
 def test_a_known_response_is_found_at_once_and_flies_everywhere_a_run_does(tmp_path):
-    answer = flytune("tune", "--settling-time", "3", "--tolerance", "30", "--out", "mine", cwd=tmp_path)
+    arguments = ["tune", "--settling-time", "3", "--tolerance", "30"]
+    told = json.loads(flytune(*arguments, "--json", "--out", "told", cwd=tmp_path).stdout)
+    assert (told["schema"], told["met"], told["directory"]) == (1, True, "told")
+    answer = flytune(*arguments, "--out", "mine", cwd=tmp_path)
     assert answer.stdout.splitlines()[-1] == "mine"
     judged = json.loads(flytune("evaluate", "mine", "--json", cwd=tmp_path).stdout)
     assert judged["position"]["settled"] == 100

@@ -212,4 +212,4 @@ def test_flytunes_world_is_flytunes_physics(late):
 
 def test_the_command_line_offers_every_simulator():
     choices = get_args(get_type_hints(FlightOptions)["simulator"])
-    assert choices == SIMULATORS
+    assert choices == tuple(SIMULATORS)

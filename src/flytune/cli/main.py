@@ -5,6 +5,7 @@ import os
 import sys
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Annotated, Literal
 
 from cyclopts import App, CycloptsError, Parameter
 
@@ -24,9 +25,11 @@ COMMANDS = (
     rules.rules,
     reproduce.reproduce,
     export.export,
+    show.list,
     show.show,
     bench.bench,
 )
+Shell = Annotated[Literal["bash", "zsh", "fish"], Parameter(name="SHELL", help="the shell that shall complete")]
 
 
 def make_app() -> App:
@@ -42,7 +45,12 @@ def make_app() -> App:
         # an option that is given twice counts as given last, so that a script can put its own behind the user's
         default_parameter=Parameter(allow_repeating=True),
     )
-    for number, command in enumerate(COMMANDS):
+
+    def completion(shell: Shell, /) -> None:
+        """Print a script that completes commands and options. In bash: source <(flytune completion bash)"""
+        print(app.generate_completion(prog_name="flytune", shell=shell))
+
+    for number, command in enumerate((*COMMANDS, completion)):
         app.command(command, sort_key=number, help_epilogue="")
     return app
 

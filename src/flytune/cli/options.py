@@ -12,7 +12,9 @@ from flytune.config.files import check_file
 from flytune.errors import BadInput
 from flytune.training.trainer import trainer_names
 
-TASK_HELP = "a preset (baseline, acrobatic, inspection, or one of them with -refined; dial), or a TOML file"
+TASK_HELP = (
+    "a preset (baseline, acrobatic, inspection, or one of them with -refined; dial), a TOML file, or a run directory"
+)
 CONTROLLER_HELP = (
     "a run directory, a policy file (.safetensors, .onnx, or a .zip of Stable-Baselines3), a policy that ships "
     "(baseline-refined, or baseline-refined@ppo), or pid, geometric, lqr (with @textbook: gains that were not tuned); "
@@ -49,7 +51,7 @@ Assignments = Annotated[
 ]
 Folder = Annotated[Path | None, Parameter(name="--out", metavar="DIR")]
 Edits = Annotated[Assignments, Parameter(name="--set")]
-AsJson = Annotated[Flag, Parameter(name="--json", help="print one JSON object instead of the table")]
+AsJson = Annotated[Flag, Parameter(name="--json", help="print one JSON object instead, and messages to standard error")]
 
 
 @Parameter(name="*")

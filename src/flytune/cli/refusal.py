@@ -25,8 +25,8 @@ def _problem(error: CycloptsError) -> str:
             return f"{typed!r}: there is no such command.{_hint(typed, known)} Allowed: {', '.join(known)}."
         case UnknownOptionError():
             typed = (error.token.keyword or error.token.value).partition("=")[0]
-            options = [name for argument in error.argument_collection for name in argument.names]
-            return f"{typed}: there is no such option.{_hint(typed, [name for name in options if name[0] == '-'])}"
+            names = [name for argument in error.argument_collection for name in argument.names if name[0] == "-"]
+            return f"{typed}: there is no such option.{_hint(typed, [*names, '--help'])}"
         case CoercionError():
             typed = error.token.value if error.token is not None else ""
             choices = get_args(error.target_type) if get_origin(error.target_type) is Literal else ()

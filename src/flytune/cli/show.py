@@ -1,6 +1,8 @@
-"""`flytune show`."""
+"""`flytune list` and `show`: what there is, and what a task holds."""
 
-from flytune.cli.options import Task
+import json
+
+from flytune.cli.options import AsJson, Task
 
 
 def show(task: Task, /) -> None:
@@ -8,3 +10,20 @@ def show(task: Task, /) -> None:
     from flytune.task.files import load_task, write_task
 
     print(write_task(load_task(task)), end="")
+
+
+def list(*, as_json: AsJson = False) -> None:
+    """Print the names that commands take: presets, vehicles, policies, controllers, simulators and trainers."""
+    from flytune.runs.catalogue import catalogue
+
+    known = catalogue()
+    if as_json:
+        print(json.dumps({"schema": 1, **known}))
+        return
+    width = max(len(name) for names in known.values() for name in names)
+    sections = (
+        f"{kind}\n" + "\n".join(f"  {name:<{width}}  {about}" for name, about in names.items())
+        for kind, names in known.items()
+        if names
+    )
+    print("\n\n".join(sections))

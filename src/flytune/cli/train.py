@@ -1,11 +1,12 @@
 """`flytune train`."""
 
+import json
 import sys
 from typing import Annotated
 
 from cyclopts import Parameter
 
-from flytune.cli.options import Edits, Flag, Folder, Task, TrainerName, Whole, assignments
+from flytune.cli.options import AsJson, Edits, Flag, Folder, Task, TrainerName, Whole, assignments
 from flytune.errors import BadInput
 from flytune.training.trainer import DEFAULT_TRAINER, TRAINERS, find_trainer
 
@@ -28,13 +29,14 @@ def train(
     ] = (),
     resume: Annotated[Flag, Parameter(help="continue the training in --out from its checkpoint")] = False,
     tensorboard: Annotated[Flag, Parameter(help="write event files for TensorBoard as well")] = False,
+    as_json: AsJson = False,
 ) -> None:
     """Train a policy for a task, and print its run directory last."""
     from flytune.control.policy import save_policy
     from flytune.control.response_map import ResponseMap
     from flytune.evaluation.evaluate import evaluate, write_evaluation
     from flytune.evaluation.measure_map import with_maps
-    from flytune.runs.directory import new_directory
+    from flytune.runs.directory import new_directory, read_facts
     from flytune.task.files import load_task
     from flytune.training.loop import train
     from flytune.training.progress import show_progress
@@ -53,9 +55,13 @@ def train(
         print("measuring the response at each setting of the dial", file=sys.stderr)
         policy = with_maps(run.policy, wanted)
         save_policy(out / "policy.safetensors", policy)
-        for each in policy.maps.values():
+        for each in policy.maps.values() if not as_json else ():
             print(ResponseMap.read(each).table(), end="\n\n")
     evaluation = evaluate(run.policy, wanted, name=str(out))
     write_evaluation(out, evaluation.judgement)
+    if as_json:
+        result = {"run": read_facts(out), "evaluation": evaluation.judgement.to_dict()}
+        print(json.dumps({"schema": 1, "directory": str(out), **result}))
+        return
     print(evaluation.judgement.line())
     print(out)

@@ -1,12 +1,14 @@
 """`flytune tune`."""
 
+import json
+import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
 from cyclopts import Parameter
 
-from flytune.cli.options import Edits, EveryTaskTrainerName, Flag, Folder, Real, Whole, assignments
+from flytune.cli.options import AsJson, Edits, EveryTaskTrainerName, Flag, Folder, Real, Whole, assignments
 from flytune.errors import Unmet
 from flytune.training.trainer import DEFAULT_TRAINER, trainer_names
 
@@ -64,7 +66,7 @@ TuneTask = Annotated[
 ]
 
 
-def tune(task: TuneTask = None, /, *, options: TuneOptions) -> None:
+def tune(task: TuneTask = None, /, *, options: TuneOptions, as_json: AsJson = False) -> None:
     """Ask for a step response: the task is edited by rules and trained, until the controller flies like that."""
     from flytune.training.progress import show_progress
     from flytune.tuning.tune import tune
@@ -72,9 +74,9 @@ def tune(task: TuneTask = None, /, *, options: TuneOptions) -> None:
     with show_progress() as on_progress:
         result = tune(
             **vars(options) | {"task": task, "edits": assignments(options.edits)},
-            on_message=lambda line: print(line, flush=True),
+            on_message=lambda line: print(line, file=sys.stderr if as_json else sys.stdout, flush=True),
             on_progress=on_progress,
         )
-    print(result.directory)
+    print(json.dumps({"schema": 1, **result.to_dict()}) if as_json else result.directory)
     if not result.met:
         raise Unmet(result.why())

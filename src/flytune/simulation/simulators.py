@@ -8,7 +8,11 @@ from flytune.errors import BadInput
 from flytune.physics.vehicle import Vehicle
 from flytune.simulation.simulator import Simulator
 
-SIMULATORS = ("flytune", "pybullet", "mujoco")
+SIMULATORS = {
+    "flytune": "The equations of motion in JAX, differentiable; policies are trained in it.",
+    "pybullet": "PyBullet, as an independent witness; needs the extra flytune[pybullet].",
+    "mujoco": "MuJoCo, as an independent witness; needs the extra flytune[mujoco].",
+}
 
 
 def make_simulator(name: str, vehicle: Vehicle, number: int, options: Mapping[str, Any] | None = None) -> Simulator:

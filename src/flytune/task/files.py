@@ -12,6 +12,8 @@ from flytune.physics.vehicle import vehicle_table
 from flytune.task.following import check_given, settings_to_check
 from flytune.task.task import Task
 
+TASK_FILE = "task.toml"  # in a run directory
+
 # keys of task files that had another name in version 0.1
 RENAMED = {
     "apg.average": "apg.ema_decay",
@@ -36,14 +38,16 @@ def load_task(task: str | Path, edits: dict[str, Any] | None = None) -> Task:
     """A task by preset name or TOML file, with edits applied.
 
     Args:
-        task: a preset (`baseline`, `acrobatic`, `inspection`, or one of them `-refined`), or the path of a .toml file,
-            which may say `based_on = "PRESET"` and then only what it changes.
+        task: a preset (`baseline`, `acrobatic`, `inspection`, or one of them `-refined`), a run directory, or a .toml
+            file, which may say `based_on = "PRESET"` and then only what it changes.
         edits: field path -> value, for instance {"reward.velocity.weight": 0.08}; `vehicle` also takes a name.
 
     Raises:
         BadInput: unknown, unreadable, or not a task; one line that names the field.
     """
     name, given = str(task), {}
+    if name not in preset_names() and os.path.isfile(os.path.join(name, TASK_FILE)):
+        name = os.path.join(name, TASK_FILE)
     if name in preset_names():
         data, where = _preset(name), ""
     elif name.endswith(".toml") or os.path.isfile(name):
@@ -53,7 +57,7 @@ def load_task(task: str | Path, edits: dict[str, Any] | None = None) -> Task:
     else:
         hint = document.nearest(name, preset_names())
         raise BadInput(
-            f"task: {name!r} is no preset. Allowed: {', '.join(preset_names())}, or a .toml file."
+            f"task: {name!r} is no preset. Allowed: {', '.join(preset_names())}, a .toml file, or a run directory."
             + (f" Did you mean {hint}?" if hint else "")
         )
     task_read = _read(data, where)
