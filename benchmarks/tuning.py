@@ -80,8 +80,8 @@ def solve(folder: Path, index: int, method: str, seed: int) -> None:
     from flytune.control.policy import Policy, load_policy
     from flytune.errors import BadInput
     from flytune.task.task import Task
+    from flytune.tuning.asked import make_requirement
     from flytune.tuning.loop import Tuner
-    from flytune.tuning.requirement import make_requirement
     from flytune.tuning.rules import load_rules
 
     class CachedTuner(Tuner):

@@ -25,6 +25,9 @@ def test_the_rules_are_printed_as_a_table_and_as_json(tmp_path):
         (["--settling-time", "1", "--set", "termination.speed.bound=0.8"], "the speed bound of 0.8 m/s you have set"),
         (["--settling-time", "0.3"], "times the weight"),
         (["nobody", "--settling-time", "3"], "is no preset"),
+        (["--settling-time", "3", "--overshoot", "much"], "--overshoot: 'much' is not allowed. Allowed: a number, or"),
+        (["--settling-time", "3", "--error", "yaw=1"], "error: 'yaw' is not asked for. Allowed: position; add it"),
+        (["--settling-time", "3", "--axis", "roll"], "--axis: 'roll' is not allowed"),
         (["--settling-time", "3", "--set", "reward.velocity.wieght=1"], "Did you mean reward.velocity.weight"),
         (["--settling-time", "3", "--rules", "none.toml"], "none.toml: cannot be read"),
         (["--settling-time", "3", "--resume"], "resume: needs --out DIR"),
@@ -51,6 +54,29 @@ def test_a_known_response_is_found_at_once_and_flies_everywhere_a_run_does(tmp_p
         "tuned: trials last more than twice the wanted settling time" in (tmp_path / "mine" / "task.toml").read_text()
     )
     assert "already holds" in flytune("tune", "--settling-time", "3", "--out", "mine", cwd=tmp_path, expect=2).stderr
+
+
+def test_several_axes_are_asked_for_at_once_each_with_its_own_bounds(tmp_path):
+    arguments = [
+        "--axis",
+        "position",
+        "yaw",
+        "--overshoot",
+        "5",
+        "yaw=8",
+        "--error",
+        "yaw=0.5",
+        "--percentile",
+        "yaw=90",
+    ]
+    told = json.loads(flytune("tune", "--settling-time", "4", *arguments, "--json", cwd=tmp_path).stdout)
+    assert told["met"]
+    assert (
+        "yaw settles no later (percentile 90 of the trials), overshoot at most 8 %, error at most 0.5 deg"
+        in told["title"]
+    )
+    page = (tmp_path / told["directory"] / "report.html").read_text()
+    assert "yaw: settling time, percentile 90" in page and "yaw: overshoot, median" in page
 
 
 def test_what_cannot_be_met_ends_with_code_4_the_reason_and_the_best_so_far(tmp_path):

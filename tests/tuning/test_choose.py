@@ -8,9 +8,10 @@ import pytest
 
 from flytune.config import document, nested
 from flytune.task.files import load_task
+from flytune.tuning.asked import make_requirement
 from flytune.tuning.choose import choose
 from flytune.tuning.iteration import HALF_WAY, Iteration
-from flytune.tuning.requirement import ResponseSummary, make_requirement
+from flytune.tuning.requirement import ResponseSummary
 from flytune.tuning.rules import load_rules
 from flytune.tuning.sensitivity import load_sensitivities
 from flytune.tuning.slopes import Context

@@ -6,8 +6,8 @@ from flytune.control.classical import classical_controller
 from flytune.errors import BadInput
 from flytune.evaluation.fly import fly
 from flytune.task.files import load_task
+from flytune.tuning.asked import make_requirement
 from flytune.tuning.feasibility import check_feasible
-from flytune.tuning.requirement import make_requirement
 
 
 @pytest.fixture(scope="module")

@@ -12,7 +12,7 @@ from flytune.evaluation.fly import fly
 from flytune.evaluation.judge import judge
 from flytune.runs.find import find_controller
 from flytune.task.files import load_task
-from flytune.tuning.requirement import make_requirement
+from flytune.tuning.asked import make_requirement
 from flytune.tuning.rules import Rule, load_rules
 from flytune.tuning.tune import tune
 

@@ -10,7 +10,8 @@ from flytune.errors import BadInput
 from flytune.evaluation.fly import fly
 from flytune.evaluation.judge import judge
 from flytune.task.files import load_task
-from flytune.tuning.requirement import ResponseSummary, make_requirement
+from flytune.tuning.asked import make_requirement
+from flytune.tuning.requirement import ResponseSummary
 
 GOOD = ResponseSummary(settling_time=2.5, overshoot=0.0, error=0.001, settled=1.0, constraints_satisfied=1.0)
 
@@ -36,6 +37,11 @@ def but(**changes):
         ({"settling_time": 2, "percentile": 0.5}, r"percentile: 0\.5 .*Did you mean 50\?"),
         ({"settling_time": 2, "percentile": 100}, r"percentile: 100 is not allowed"),
         ({"settling_time": 2, "axis": "w"}, r"axis: 'w' is not allowed\. Allowed: position, x, y, z, yaw"),
+        ({"settling_time": 2, "axis": ["x", "w"]}, r"axis: 'w' is not allowed"),
+        ({"settling_time": 2, "axis": ["x", "x"]}, r"axis: x, x is not allowed\. .* each once"),
+        ({"settling_time": 2, "axis": []}, r"axis: none is not allowed"),
+        ({"settling_time": 2, "overshoot": {"yaw": 5}}, r"overshoot: 'yaw' is not asked for\. .* add it with --axis"),
+        ({"settling_time": 2, "axis": ["x", "yaw"], "error": {"yaw": 9}}, r"error: 9 .*0\.02 to 3\.6 deg"),
     ],
 )
 def test_numbers_that_cannot_be_meant_are_refused_with_what_is_allowed(arguments, said):
@@ -48,6 +54,41 @@ def test_units_of_the_command_line_become_those_of_the_judge():
     assert wanted.overshoot == pytest.approx(0.04)
     assert wanted.error == pytest.approx(math.radians(2))
     assert wanted.tolerance == pytest.approx(0.2)
+
+
+def test_each_axis_has_its_own_bounds_and_its_own_units():
+    wanted = make_requirement(3, {"": 4, "yaw": 2}, {"z": 0.005}, axis=["position", "z", "yaw"], percentile={"yaw": 90})
+    assert (wanted.axis, wanted.overshoot, wanted.error, wanted.percentile) == ("position", 0.04, 0.01, 50)
+    height, heading = wanted.others
+    assert (height.axis, height.overshoot, height.error, height.percentile) == ("z", 0.04, 0.005, 50)
+    assert (heading.overshoot, heading.error, heading.percentile) == (0.02, pytest.approx(math.radians(1)), 90)
+    # one number is in the unit of the first axis
+    assert make_requirement(3, error=0.004, axis=["x", "y", "yaw"]).others[0].error == 0.004
+    assert make_requirement(3, error=0.004, axis=["x", "yaw"]).others[0].error == pytest.approx(math.radians(1))
+    assert make_requirement(3, error=2, axis=["yaw", "x"]).others[0].error == 0.01
+
+
+def test_of_several_axes_the_one_that_misses_its_bound_most_is_measured(pid_flights):
+    judged = judge(pid_flights)
+    alone = {axis: make_requirement(3, axis=axis).measure(judged) for axis in ("position", "yaw")}
+    both = make_requirement(3, axis=["position", "yaw"])
+    response = both.measure(judged)
+    assert (response.settling_time, response.axes) == (alone["position"].settling_time, {})
+    # the yaw turns past its target, and the bound of it is what is missed
+    turning = dataclasses.replace(judged, overshoot={**judged.overshoot, "yaw": np.full(40, 0.2)})
+    response = both.measure(turning)
+    assert (response.overshoot, response.axes) == (0.2, {"overshoot": "yaw"})
+    assert both.misses(response)["overshoot"] == pytest.approx(0.15)
+    assert "overshoot" not in make_requirement(3, {"yaw": 25}, axis=["position", "yaw"]).misses(response)
+    # the yaw settles later than allowed
+    late = dataclasses.replace(judged, settling_time={**judged.settling_time, "yaw": np.full(40, 3.4)})
+    response = both.measure(late)
+    assert (response.settling_time, response.axes) == (3.4, {"settling_time": "yaw"})
+    assert both.misses(response)["settling_time"] > 0
+    # a trial has settled where all axes have
+    never = np.where(np.arange(40) < 10, np.inf, judged.settling_time["yaw"])
+    lost = dataclasses.replace(judged, settling_time={**judged.settling_time, "yaw": never})
+    assert both.measure(lost).settled == pytest.approx(0.75)
 
 
 @pytest.mark.parametrize(

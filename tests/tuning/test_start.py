@@ -6,7 +6,7 @@ import pytest
 
 from flytune.errors import BadInput
 from flytune.task.files import load_task
-from flytune.tuning.requirement import make_requirement
+from flytune.tuning.asked import make_requirement
 from flytune.tuning.start import find_start
 
 BOUND = {"termination.altitude.bound": 0.09}  # a field that all known tasks have
@@ -104,3 +104,28 @@ def test_a_bound_of_the_user_that_the_dial_breaks_lets_the_other_policies_be_tri
 def test_the_dial_is_set_within_the_range_that_the_user_gives():
     start = find_start(make_requirement(2.2), None, {"dial.speed.highest": 1.0}, "apg")
     assert start.setting["speed"] <= 1.0
+
+
+@pytest.mark.parametrize(
+    ("edits", "field", "weights"),
+    [
+        # the known policies fly another vehicle
+        ({"vehicle": "crazyflie-measured"}, "vehicle.", "new"),
+        ({"vehicle.mass": 0.04, "reward.velocity.weight": 0.2}, "vehicle.mass", "new"),
+        # a policy that meets the requirement, but was not trained with the reward that is wanted
+        ({"reward.velocity.weight": 0.2}, "reward.velocity.weight", "known"),
+        # a bound that the known policies break
+        ({"termination.body_rate.bound_deg_per_s": 150.0}, "termination.body_rate", "known"),
+    ],
+)
+def test_a_policy_of_another_task_is_not_edited_but_the_task_is_trained_first(edits, field, weights):
+    start = find_start(make_requirement(3), None, edits, "apg")
+    assert start.policy is None
+    assert start.trained_for.startswith(field)
+    assert (start.initial is None) == (weights == "new")
+
+
+def test_a_policy_of_another_vehicle_is_used_where_it_meets_the_requirement_there():
+    start = find_start(make_requirement(3), None, {"vehicle": "crazyflie-km794"}, "apg")
+    assert start.policy is not None
+    assert start.task.vehicle.name == "crazyflie-km794"

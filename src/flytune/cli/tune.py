@@ -2,15 +2,19 @@
 
 import json
 import sys
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from cyclopts import Parameter
 
 from flytune.cli.options import AsJson, Edits, EveryTaskTrainerName, Flag, Folder, Real, Whole, assignments
-from flytune.errors import Unmet
+from flytune.errors import BadInput, Unmet
 from flytune.training.trainer import DEFAULT_TRAINER, trainer_names
+
+PER_AXIS = ("overshoot", "error", "percentile")  # options that may differ from axis to axis
+PerAxis = Annotated[tuple[str, ...], Parameter(consume_multiple=(1, None), negative=(), show_default=False)]
 
 
 @Parameter(name="*")
@@ -24,17 +28,31 @@ class TuneOptions:
     ]
     at_most: Annotated[Flag, Parameter(help="the settling time is an upper bound, not a target")] = False
     tolerance: Annotated[Real, Parameter(metavar="PCT", help="tolerance of the settling time, in percent of it")] = 10.0
-    overshoot: Annotated[Real, Parameter(metavar="PCT", help="largest median overshoot, in percent of the step")] = 5.0
+    overshoot: Annotated[
+        PerAxis,
+        Parameter(metavar="[AXIS=]PCT", help="largest median overshoot, in percent of the step (default: 5)"),
+    ] = ()
     error: Annotated[
-        Real | None,
-        Parameter(metavar="M", help="largest median steady-state error, in metres (default: 0.01); yaw: degrees (1)"),
-    ] = None
-    axis: Annotated[Literal["position", "x", "y", "z", "yaw"], Parameter(help="the axis whose response counts")] = (
-        "position"
-    )
+        PerAxis,
+        Parameter(
+            metavar="[AXIS=]M", help="largest median steady-state error, in metres (default: 0.01); yaw: degrees (1)"
+        ),
+    ] = ()
+    axis: Annotated[
+        tuple[Literal["position", "x", "y", "z", "yaw"], ...],
+        Parameter(
+            consume_multiple=(1, None),
+            negative=(),
+            help="the axis whose response counts; or several: the first one settles in the time asked for, the others "
+            "settle no later",
+        ),
+    ] = ("position",)
     percentile: Annotated[
-        Real, Parameter(metavar="PCT", help="percentile of the trials that the settling time is taken at")
-    ] = 50.0
+        PerAxis,
+        Parameter(
+            metavar="[AXIS=]PCT", help="percentile of the trials that the settling time is taken at (default: 50)"
+        ),
+    ] = ()
     edits: Annotated[
         Edits, Parameter(help="fix a field of the task: the tuner does not change it, and keeps a bound set here")
     ] = ()
@@ -56,6 +74,30 @@ class TuneOptions:
     out: Annotated[Folder, Parameter(help="run directory (default: a new one under runs/)")] = None
     resume: Annotated[Flag, Parameter(help="continue the tuning in --out")] = False
 
+    def arguments(self) -> dict[str, Any]:
+        """The keyword arguments of `flytune.tune`."""
+        given = {name: per_axis(name, getattr(self, name)) for name in PER_AXIS if getattr(self, name)}
+        others = {name: value for name, value in vars(self).items() if name not in PER_AXIS}
+        return {**others, **given, "edits": assignments(self.edits)}
+
+
+def per_axis(name: str, texts: Sequence[str]) -> float | dict[str, float]:
+    """The number that an option gives for all axes, or axis -> number; "" stands for all others.
+
+    Raises:
+        BadInput: a text that is no number.
+    """
+    found: dict[str, float] = {}
+    for text in texts:
+        axis, _, value = text.rpartition("=")
+        try:
+            found[axis] = float(value)
+        except ValueError:
+            raise BadInput(
+                f"--{name}: {text!r} is not allowed. Allowed: a number, or AXIS=NUMBER for one axis, as in yaw=2."
+            ) from None
+    return found[""] if list(found) == [""] else found
+
 
 TuneTask = Annotated[
     str | None,
@@ -73,7 +115,8 @@ def tune(task: TuneTask = None, /, *, options: TuneOptions, as_json: AsJson = Fa
 
     with show_progress() as on_progress:
         result = tune(
-            **vars(options) | {"task": task, "edits": assignments(options.edits)},
+            **options.arguments(),
+            task=task,
             on_message=lambda line: print(line, file=sys.stderr if as_json else sys.stdout, flush=True),
             on_progress=on_progress,
         )

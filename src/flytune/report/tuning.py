@@ -4,6 +4,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import plotly.graph_objects as go
 
 from flytune.evaluation.evaluate import Evaluation, evaluate
@@ -54,41 +55,58 @@ def evaluate_best(tuning: Mapping[str, Any]) -> Evaluation:
 
 def requirement_table(tuning: Mapping[str, Any], judgement: Judgement) -> Table:
     """What was required, what the best policy reached on the validation set, and whether that is met."""
-    required, misses = tuning["requirement"], _last_validation(tuning)["misses"]
-    axis, percentile = required["axis"], required["percentile"]
-    unit, scale, decimals = error_unit(axis)
-    times, level = judgement.settling_time[axis], "median" if percentile == 50 else f"percentile {percentile:g}"
-    time = "at most {0:g} s" if required["at_most"] else "{0:g} s ± {1:g} %"
-    overshoot, error = median(judgement.overshoot[axis]), median(judgement.steady_state_error[axis])
-    settled, share = judgement.settled(axis), f"at least {100 * required['settled']:g} %"
-    rows = {
-        "settling_time": (
-            f"settling time, {level}",
-            time.format(required["settling_time"], 100 * required["tolerance"]),
-            _with_unit(quantile(times, percentile / 100), 2, 1.0, "s"),
-        ),
-        "overshoot": (
-            "overshoot, median",
-            f"at most {100 * required['overshoot']:g} %",
-            _with_unit(overshoot, 1, 100.0, "%"),
-        ),
-        "error": (
-            "steady-state error, median",
-            f"at most {scale * required['error']:.3g} {unit}",
-            _with_unit(error, decimals, scale, unit),
-        ),
-        "settled": (
-            "trials that settle",
-            share,
-            f"{100 * settled / judgement.trials:g} % ({settled} of {judgement.trials})",
-        ),
-    }
+    required, last = tuning["requirement"], _last_validation(tuning)
+    misses, axes = last["misses"], last["axes"]
+    asked = [required, *required["others"]]
+    met, missed = Cell(text="met", tone="verdict good"), Cell(text="not met", tone="verdict bad")
+
+    def verdict(measure: str, axis: str) -> Cell:
+        return missed if measure in misses and axes.get(measure, required["axis"]) == axis else met
+
+    rows = [
+        (*row, verdict(measure, limits["axis"]))
+        for limits in asked
+        for measure, *row in _axis_rows(required, limits, judgement)
+    ]
+    times = np.stack([judgement.settling_time[limits["axis"]] for limits in asked])
+    settled = int(np.sum(np.all(np.isfinite(times), axis=0)))
+    share = f"at least {100 * required['settled']:g} %"
+    reached = f"{100 * settled / judgement.trials:g} % ({settled} of {judgement.trials})"
+    rows.append(("trials that settle", share, reached, missed if "settled" in misses else met))
     if "constraints_satisfied" in misses:
         satisfied = 100 * (required["settled"] + misses["constraints_satisfied"])
-        rows["constraints_satisfied"] = ("trials that satisfy your constraints", share, f"{satisfied:.3g} %")
-    met, missed = Cell(text="met", tone="verdict good"), Cell(text="not met", tone="verdict bad")
-    cells = [(*row, missed if name in misses else met) for name, row in rows.items()]
-    return Table.plain((axis, "required", "reached", ""), cells, style="narrow")
+        rows.append(("trials that satisfy your constraints", share, f"{satisfied:.3g} %", missed))
+    return Table.plain((required["axis"], "required", "reached", ""), rows, style="narrow")
+
+
+def _axis_rows(required: Mapping[str, Any], limits: Mapping[str, Any], judgement: Judgement) -> list[tuple[str, ...]]:
+    """Measure, title, what was required and what was reached, for one axis."""
+    axis, percentile = limits["axis"], limits["percentile"]
+    leading = axis == required["axis"]
+    whose = "" if leading else f"{axis}: "
+    unit, scale, decimals = error_unit(axis)
+    level = "median" if percentile == 50 else f"percentile {percentile:g}"
+    longest = required["settling_time"] * (1 if required["at_most"] else 1 + required["tolerance"])
+    time = f"at most {longest:.3g} s"
+    if leading and not required["at_most"]:
+        time = f"{required['settling_time']:g} s ± {100 * required['tolerance']:g} %"
+    settling_time = quantile(judgement.settling_time[axis], percentile / 100)
+    overshoot, error = median(judgement.overshoot[axis]), median(judgement.steady_state_error[axis])
+    return [
+        ("settling_time", f"{whose}settling time, {level}", time, _with_unit(settling_time, 2, 1.0, "s")),
+        (
+            "overshoot",
+            f"{whose}overshoot, median",
+            f"at most {100 * limits['overshoot']:g} %",
+            _with_unit(overshoot, 1, 100.0, "%"),
+        ),
+        (
+            "error",
+            f"{whose}steady-state error, median",
+            f"at most {scale * limits['error']:.3g} {unit}",
+            _with_unit(error, decimals, scale, unit),
+        ),
+    ]
 
 
 def edit_table(tuning: Mapping[str, Any]) -> Table:

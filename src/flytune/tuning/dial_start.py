@@ -29,6 +29,7 @@ class DialStart:
 
     setting: dict[str, float]
     task: Task
+    family: Task  # the same with its dial
     policy: Policy
     record: Path  # run.json of the training
     flights: Flights  # on the training set
@@ -83,6 +84,7 @@ def _flown(
     return DialStart(
         setting=policy.setting,
         task=task,
+        family=family,
         policy=fixed,
         record=record,
         flights=flights,

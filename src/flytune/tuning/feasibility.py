@@ -1,6 +1,7 @@
 """Feasibility of a requirement: lower bounds on the settling time by the user's constraints and by the vehicle."""
 
 import math
+from functools import partial
 
 import numpy as np
 from jaxtyping import Float
@@ -11,7 +12,7 @@ from flytune.evaluation.lower_bounds import settling_time_bound, thrust_bound
 from flytune.evaluation.metrics import YAW_BAND, wrap_angle, yaw_angle
 from flytune.evaluation.statistics import quantile
 from flytune.task.task import Task
-from flytune.tuning.requirement import Requirement
+from flytune.tuning.requirement import AxisLimits, Requirement
 from flytune.tuning.rules import is_fixed
 
 
@@ -27,21 +28,30 @@ def check_feasible(task: Task, requirement: Requirement, flights: Flights, fixed
     Raises:
         BadInput: too many trials cannot settle in time; the message names the lower bound and its cause.
     """
-    axis = requirement.axis
+    for limits in (requirement, *requirement.others):
+        _check_axis(task, requirement, limits, flights, fixed)
+
+
+def _check_axis(
+    task: Task, requirement: Requirement, limits: AxisLimits, flights: Flights, fixed: tuple[str, ...]
+) -> None:
+    """The same for one axis that is asked for."""
+    axis = limits.axis
+    compare = partial(_compare, requirement, limits.percentile)
     if axis == "yaw":
         angle = np.abs(wrap_angle(yaw_angle(flights.attitude[:, 0]) - flights.target_yaw))
         for name, end in task.termination.items():
             if end.quantity == "body_rate" and is_fixed(f"termination.{name}.{end.key}", fixed):
                 rate = float(end.limit)
                 cause = f"the body rate bound of {math.degrees(float(end.limit)):g} deg/s you have set"
-                _compare(requirement, settling_time_bound(angle, rate, YAW_BAND), cause)
+                compare(settling_time_bound(angle, rate, YAW_BAND), cause)
         return
     way = np.asarray(flights.target_position - flights.position[:, 0], dtype=np.float64)
     distance = np.linalg.norm(way, axis=1) if axis == "position" else np.abs(way[:, "xyz".index(axis)])
     for name, end in task.termination.items():
         if end.quantity == "speed" and is_fixed(f"termination.{name}.{end.key}", fixed):
             cause = f"the speed bound of {float(end.limit):g} m/s you have set"
-            _compare(requirement, settling_time_bound(distance, float(end.limit)), cause, distance)
+            compare(settling_time_bound(distance, float(end.limit)), cause, distance)
     gravity = float(task.vehicle.gravity)
     thrust = float(task.vehicle.thrust_to_weight) * gravity
     if axis == "position":
@@ -49,17 +59,18 @@ def check_feasible(task: Task, requirement: Requirement, flights: Flights, fixed
     else:
         climb = np.sign(way[:, 2]) if axis == "z" else np.zeros(len(distance))
     bound = thrust_bound(distance, thrust - gravity * climb, thrust + gravity * climb)
-    _compare(requirement, bound, f"a thrust of {thrust / gravity:.3g} times the weight", distance)
+    compare(bound, f"a thrust of {thrust / gravity:.3g} times the weight", distance)
 
 
 def _compare(
     requirement: Requirement,
+    percentile: float,
     bound: Float[np.ndarray, "N"],
     cause: str,
     distance: Float[np.ndarray, "N"] | None = None,
 ) -> None:
     """Nothing, where the lower bounds in s allow the required settling time at its percentile; else BadInput."""
-    share, wanted = requirement.percentile / 100, requirement.maximum_settling_time()
+    share, wanted = percentile / 100, requirement.maximum_settling_time()
     least = quantile(bound, share)
     if least is None or least <= wanted:
         return
@@ -67,6 +78,6 @@ def _compare(
     allowed = math.ceil(100 * least / (wanted / requirement.settling_time)) / 100
     raise BadInput(
         f"settling-time: {requirement.settling_time:g} s is not possible: with {cause}, percentile "
-        f"{requirement.percentile:g} of the trials takes at least {least:.2f} s{way} with any controller. "
+        f"{percentile:g} of the trials takes at least {least:.2f} s{way} with any controller. "
         f"Allowed: {allowed:g} s or more, or another bound."
     )

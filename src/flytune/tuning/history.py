@@ -11,7 +11,7 @@ from flytune.errors import BadInput
 from flytune.tuning.iteration import Iteration, Validation
 from flytune.tuning.requirement import Requirement
 
-SCHEMA = 2  # of tune.json
+SCHEMA = 3  # of tune.json
 TRAINING_SEED, TRAINING_TRIALS = 3000, 100  # the first training set
 VALIDATION_SEED, VALIDATION_TRIALS = 4000, 200  # the first validation set; each further one has the next seed
 MOST_VALIDATIONS = 3  # of one iteration

@@ -29,6 +29,7 @@ class Edit:
     known_from: str  # iterations, interpolation, sensitivity or rule
     between: tuple[float, float] | None  # values of the field that the slope was measured between
     gain: float  # share of the miss that the edit is predicted to remove, 1 at most
+    axis: str = ""  # of the measure
     next_best: "Edit | None" = None  # the best edit of another field
 
     @property
@@ -77,6 +78,7 @@ class Validation:
     seed: int  # of the validation set
     judgement: dict[str, Any]  # as `evaluate --json` prints it
     misses: dict[str, float]  # as `Requirement.misses` has them; empty where the requirement is met
+    axes: Mapping[str, str] = dataclasses.field(default_factory=dict)  # measure -> its axis, where not the leading one
 
 
 def value_in(iteration: Iteration, field: str, iterations: Sequence[Iteration]) -> float | None:

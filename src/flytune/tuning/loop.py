@@ -114,7 +114,7 @@ class Tuner:
         """Add the first iteration: the policy of the nearest known task, or a training where none is known."""
         start, first = self.start, Iteration(number=0)
         if start.policy is None or start.record is None or start.judgement is None:
-            self._say("start", f"{start.name}: no policy for this task is known; it is trained from new weights")
+            self._say("start", messages.describe_first_training(start.name, start.trained_for, bool(start.initial)))
             self.train(first)
             return
         self._say("start", messages.describe_start(start.name, start.times, start.setting, self.duration))
@@ -132,7 +132,7 @@ class Tuner:
             Diverged: the first training diverged.
         """
         task = self.task_of(planned)
-        initial = None
+        initial = self.start.initial if planned.parent is None else None
         if find_trainer(self.trainer).supports_warm_start and planned.parent is not None:
             initial = self._policy(planned.parent)
         seconds = 0.0
@@ -162,7 +162,7 @@ class Tuner:
 
     def task_of(self, iteration: Iteration) -> Task:
         """The task of an iteration: that of the start with the values of the iteration."""
-        if iteration.number == 0 and self.start.policy is None:
+        if iteration.number == 0 and self.start.policy is None and self.start.initial is None:
             return self.start.first
         return edited(self.tables, iteration.values, iteration.reasons)
 
@@ -175,12 +175,12 @@ class Tuner:
         response = self._response(judgement)
         validation = Validation(
             iteration=iteration.number, seed=seed, judgement=judgement.to_dict(),
-            misses=self.requirement.misses(response),
+            misses=self.requirement.misses(response), axes=response.axes,
         )  # fmt: skip
         self.history.validations.append(validation)
         self.history.write()
         text = messages.describe(response, self.requirement, bounds=bool(self.constraints))
-        outcome = messages.describe_misses(validation.misses, self.requirement)
+        outcome = messages.describe_misses(validation.misses, self.requirement, response.axes)
         self._say(
             "validation",
             f"iteration {iteration.number} in {VALIDATION_TRIALS} trials with new initial conditions: {text}; "
@@ -231,7 +231,7 @@ class Tuner:
     def _apply(self, parent: Iteration, edit: Edit) -> None:
         """Make an edit, and train with it."""
         number = len(self.history.iterations)
-        self._say(f"edit {number}", f"of iteration {parent.number}, {messages.describe_edit(edit, self.target)}")
+        self._say(f"edit {number}", f"of iteration {parent.number}, {messages.describe_edit(edit)}")
         so_far = parent.reasons.get(edit.field, f"tuned: {edit.before:g}").split(",")[0]
         reason = f"{so_far} -> {edit.after:g}, {edit.symptom}: {edit.reason} ({edit.rule}, {edit.source})"
         values, reasons = {**parent.values, edit.field: edit.after}, {**parent.reasons, edit.field: reason}

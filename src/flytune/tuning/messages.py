@@ -21,16 +21,19 @@ def describe(
 
     Args:
         response: the response.
-        requirement: the requirement, for the units.
+        requirement: the requirement, for the axes.
         notes: measure -> a note in brackets.
         bounds: whether the user has set constraints, which are then always mentioned.
     """
-    numbers = {name: with_unit(name, getattr(response, name), requirement) for name in vars(response)}
+    axes = {name: requirement.axis_of(name, response) for name in vars(response) if name != "axes"}
+    numbers = {name: with_unit(name, getattr(response, name), axis) for name, axis in axes.items()}
+    of = {name: f" ({axis})" if requirement.others else "" for name, axis in axes.items()}
     settles = math.isfinite(response.settling_time)
     texts = {
-        "settling_time": f"settles in {numbers['settling_time']}" if settles else "does not settle",
-        "overshoot": f"overshoot {numbers['overshoot']}",
-        "error": f"error {numbers['error']}",
+        "settling_time": (f"settles in {numbers['settling_time']}" if settles else "does not settle")
+        + of["settling_time"],
+        "overshoot": f"overshoot {numbers['overshoot']}{of['overshoot']}",
+        "error": f"error {numbers['error']}{of['error']}",
         "settled": f"{numbers['settled']} settled",
         "constraints_satisfied": f"your constraints are satisfied in {numbers['constraints_satisfied']}",
     }
@@ -42,11 +45,18 @@ def describe_target(target: Requirement, trials: int, duration: float) -> str:
     """The requirement on the training set, and when a trial counts as settled."""
     lowest, highest = (1 - target.tolerance) * target.settling_time, target.maximum_settling_time()
     time = f"at most {highest:.2f} s" if target.at_most else f"{lowest:.2f} to {highest:.2f} s"
-    band = f"{math.degrees(YAW_BAND):g} deg" if target.axis == "yaw" else f"{100 * POSITION_BAND:g} cm"
+    asked = (target, *target.others)
+    bounds = (
+        f"{f'{each.axis}: ' if target.others else ''}overshoot at most {with_unit('overshoot', each.overshoot)}, "
+        f"error at most {with_unit('error', each.error, each.axis)}"
+        for each in asked
+    )
+    units = {each.axis == "yaw" for each in asked}
+    band = " and ".join(
+        [f"{100 * POSITION_BAND:g} cm"] * (False in units) + [f"{math.degrees(YAW_BAND):g} deg"] * (True in units)
+    )
     return (
-        f"{trials} trials of {duration:g} s; required there: {time}, overshoot at most "
-        f"{with_unit('overshoot', target.overshoot, target)}, error at most "
-        f"{with_unit('error', target.error, target)}. "
+        f"{trials} trials of {duration:g} s; required there: {time}, {'; '.join(bounds)}. "
         f"A trial has settled if it stays within {band} until its end; a trial that has not counts as infinitely slow"
     )
 
@@ -69,15 +79,30 @@ def describe_start(name: str, times: Mapping[str, float], setting: Mapping[str, 
     return f"settling times of the known policies: {known}{nearest}"
 
 
-def describe_edit(edit: Edit, requirement: Requirement) -> str:
+def describe_first_training(name: str, trained_for: str, warm: bool) -> str:
+    """Why a tuning begins with a training without an edit, and from which weights.
+
+    Args:
+        name: of the task it begins with.
+        trained_for: the field in which the task of the known policy differs, empty where no policy is known.
+        warm: whether the training starts from the weights of that policy.
+    """
+    known = "no policy for this task is known"
+    if trained_for:
+        known = f"its policy was trained with another {trained_for}"
+    weights = "the weights of this policy" if warm else "new weights"
+    return f"{name}: {known}; the task is trained without an edit first, from {weights}"
+
+
+def describe_edit(edit: Edit) -> str:
     """An edit in one line: the symptom, the edit, the prediction and its origin, the rule, and the next best edit."""
     symptom = "the last edit was too large" if edit.rule == HALF_WAY else edit.symptom
     origin = f" ({_origin(edit)})" if _origin(edit) else ""
     source = "" if edit.rule.startswith(f"{edit.source.removeprefix('paper ')} ") else f" ({edit.source})"
     next_best = ""
     if edit.next_best is not None and edit.next_best.expected is not None:
-        next_best = f". Next best: {_change(edit.next_best, requirement)} ({edit.next_best.rule})"
-    return f"{symptom}: {_change(edit, requirement)}{origin}. {edit.rule}: {edit.reason}{source}{next_best}"
+        next_best = f". Next best: {_change(edit.next_best)} ({edit.next_best.rule})"
+    return f"{symptom}: {_change(edit)}{origin}. {edit.rule}: {edit.reason}{source}{next_best}"
 
 
 def describe_iteration(
@@ -96,52 +121,63 @@ def describe_iteration(
     notes = {}
     if iteration.edit is not None and before is not None:
         measure = iteration.edit.measure
-        note = f"was {with_unit(measure, getattr(before, measure), requirement)}"
+        note = f"was {with_unit(measure, getattr(before, measure), requirement.axis_of(measure, before))}"
         if iteration.edit.expected is not None:
-            note += f", expected {with_unit(measure, iteration.edit.expected, requirement)}"
+            note += f", expected {with_unit(measure, iteration.edit.expected, iteration.edit.axis)}"
         notes[measure] = f" ({note})"
     return (
         f"{describe(iteration.response, requirement, notes, bounds=bounds)}; "
-        f"{describe_misses(requirement.misses(iteration.response), requirement)}"
+        f"{describe_misses(requirement.misses(iteration.response), requirement, iteration.response.axes)}"
     )
 
 
-def describe_misses(misses: Mapping[str, float], requirement: Requirement) -> str:
-    """All misses in words, or that the requirement is met."""
-    texts = [describe_miss(name, size, requirement) for name, size in misses.items()]
+def describe_misses(
+    misses: Mapping[str, float], requirement: Requirement, axes: Mapping[str, str] | None = None
+) -> str:
+    """All misses in words, or that the requirement is met; `axes` are those of the response."""
+    texts = [describe_miss(name, size, requirement, (axes or {}).get(name)) for name, size in misses.items()]
     return f"not met: {', '.join(texts)}" if texts else "met"
 
 
-def describe_miss(measure: str, size: float, requirement: Requirement) -> str:
-    """One miss, as `Requirement.misses` has it, in words."""
+def describe_miss(measure: str, size: float, requirement: Requirement, axis: str | None = None) -> str:
+    """One miss, as `Requirement.misses` has it, in words.
+
+    Args:
+        measure: what misses its bound.
+        size: by how much.
+        requirement: the requirement.
+        axis: the axis of the measure, the leading one where None.
+    """
+    axis = axis or requirement.axis
+    whose = f"{axis} " if requirement.others else ""
     if measure == "settling_time":
         side, limit = ("slow" if size > 0 else "fast"), f"{requirement.settling_time:g} s"
         ratio = requirement.aim() * math.exp(size) / requirement.settling_time
         share = f"{100 * abs(ratio - 1):.0f} %" if abs(size) < LARGEST_MISS else "far"
-        return f"{share} too {side} for {'at most ' if requirement.at_most else ''}{limit}"
+        return f"{whose}{share} too {side} for {'at most ' if requirement.at_most else ''}{limit}"
     if measure in ("settled", "constraints_satisfied"):
-        share = with_unit(measure, requirement.settled + size, requirement)
+        share = with_unit(measure, requirement.settled + size)
         return f"only {share} of the trials {'settle' if measure == 'settled' else 'satisfy your constraints'}"
-    return f"{measure} above {with_unit(measure, getattr(requirement, measure), requirement)}"
+    return f"{whose}{measure} above {with_unit(measure, getattr(requirement.limits(axis), measure), axis)}"
 
 
-def with_unit(measure: str, value: float, requirement: Requirement) -> str:
-    """A number of a measure with its unit."""
+def with_unit(measure: str, value: float, axis: str = "") -> str:
+    """A number of a measure of an axis with its unit."""
     if not math.isfinite(value):
         return "never" if measure == "settling_time" else "infinite"
     if measure == "settling_time":
         return f"{value:.2f} s"
     if measure == "error":
-        return f"{math.degrees(value):.2f} deg" if requirement.axis == "yaw" else f"{1e3 * value:.2f} mm"
+        return f"{math.degrees(value):.2f} deg" if axis == "yaw" else f"{1e3 * value:.2f} mm"
     return f"{100 * value:.1f} %"
 
 
-def _change(edit: Edit, requirement: Requirement) -> str:
+def _change(edit: Edit) -> str:
     """What is edited, and the expected value of the measure."""
     unit = f" {edit.unit}" if edit.unit and "unit(" not in edit.unit else ""
     expected = ""
     if edit.expected is not None:
-        expected = f", expected {_name(edit.measure)} {with_unit(edit.measure, edit.expected, requirement)}"
+        expected = f", expected {_name(edit.measure)} {with_unit(edit.measure, edit.expected, edit.axis)}"
     return f"{edit.field} {edit.before:g} -> {edit.after:g}{unit}{expected}"
 
 

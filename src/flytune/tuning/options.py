@@ -54,7 +54,7 @@ def _propose(context: Context, rule: Rule, iteration: Iteration) -> Edit:
         after, gain, expected = apply_rule(rule, value, float(rule.largest) ** up), 0.5, None
     else:
         # never zero: a miss is outside of what is allowed, and the aim is inside
-        wanted = math.log(_aim(rule.measure, context.requirement) / max(now, 1e-9))
+        wanted = math.log(_aim(rule.measure, context.requirement, iteration) / max(now, 1e-9))
         slope = interpolated(context, rule, iteration, value, wanted, slope)
         after = apply_rule(rule, value, math.exp(max(-3.0, min(3.0, wanted / slope.power))))
         predicted = slope.power * math.log(after / value)
@@ -70,6 +70,7 @@ def _propose(context: Context, rule: Rule, iteration: Iteration) -> Edit:
         rule=rule.name, source=rule.source, reason=rule.reason, symptom=rule.when,
         field=rule.field, before=value, after=after, unit=document.unit_of(Task, context.tables, rule.field),
         expected=expected, slope=slope.power, known_from=slope.known_from, between=slope.between, gain=gain,
+        axis=context.axis_of(rule.measure, iteration),
     )  # fmt: skip
 
 
@@ -89,16 +90,20 @@ def _editable_value(context: Context, rule: Rule, iteration: Iteration) -> float
         raise NotUsed(f"the task has no {rule.field}, or it is 0")
     if missed := [measure for measure in rule.requires if measure in misses and measure != rule.measure]:
         raise NotUsed(f"not while the {' and the '.join(missed).replace('_', ' ')} is missed")
-    if context.same_trainer and not context.sensitivities.has_effect(rule.field, context.requirement.axis):
+    if context.same_trainer and not context.sensitivities.has_effect(
+        rule.field, context.axis_of(rule.measure, iteration)
+    ):
         raise NotUsed("it has no measured effect")
     return value
 
 
-def _aim(measure: str, requirement: Requirement) -> float:
+def _aim(measure: str, requirement: Requirement, iteration: Iteration) -> float:
     """The value of a measure that an edit aims at: the settling time itself, half of the bound of the others."""
     if measure == "settling_time":
         return requirement.aim()
-    return 0.5 * (max(requirement.overshoot, 1e-3) if measure == "overshoot" else requirement.error)
+    if measure == "overshoot":
+        return 0.5 * max(requirement.limit("overshoot", iteration.response), 1e-3)
+    return 0.5 * requirement.limit("error", iteration.response)
 
 
 def _has_disappointed(context: Context, rule: Rule, value: float) -> bool:
@@ -167,7 +172,7 @@ def _nearest_variant(context: Context, edit: Edit, iteration: Iteration) -> Iter
 
 def _causes_miss(context: Context, edit: Edit, iteration: Iteration, measure: str) -> bool:
     """Whether a measure misses its requirement after the edit, by its measured sensitivity."""
-    what = (edit.field, measure, edit.before, context.requirement.axis, edit.after > edit.before)
+    what = (edit.field, measure, edit.before, context.axis_of(measure, iteration), edit.after > edit.before)
     slope = context.sensitivities.slope(*what)
     if slope is None or not context.sensitivities.is_significant(*what):
         return False

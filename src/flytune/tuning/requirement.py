@@ -2,19 +2,16 @@
 
 import dataclasses
 import math
-from collections.abc import Callable, Collection
-from typing import Any
+from collections.abc import Callable, Collection, Mapping
+from typing import Any, Literal, Self
 
 import numpy as np
 
-from flytune.errors import BadInput
 from flytune.evaluation.judge import Judgement
-from flytune.evaluation.metrics import POSITION_BAND, YAW_BAND
 from flytune.evaluation.statistics import quantile
 from flytune.task.task import Task
 
 AXES = ("position", "x", "y", "z", "yaw")
-LONGEST = 60.0  # s
 LARGEST_MISS = 20.0  # also where the measure is infinite
 TRAINING_TOLERANCE, TRAINING_BOUNDS = 0.5, 0.8  # on the training set, as shares of those on a validation set
 
@@ -23,23 +20,27 @@ TRAINING_TOLERANCE, TRAINING_BOUNDS = 0.5, 0.8  # on the training set, as shares
 class ResponseSummary:
     """One number per measure of a judged response, +inf where too few trials have one.
 
+    Where several axes are asked for, it is that of the axis that misses its requirement most.
+
     Source: docs/concepts/definitions.md.
     """
 
     settling_time: float  # s, at the percentile asked for
     overshoot: float  # fraction of the step, median
     error: float  # m, rad for yaw; median
-    settled: float  # share of the trials
+    settled: float  # share of the trials, on all axes asked for
     constraints_satisfied: float  # share of the feasible trials that violate no constraint of the user
+    axes: Mapping[str, str] = dataclasses.field(default_factory=dict)  # measure -> its axis, where not the leading one
 
-    def to_dict(self) -> dict[str, float | None]:
+    def to_dict(self) -> dict[str, Any]:
         """Plain numbers, None where infinite."""
-        return {name: v if math.isfinite(v) else None for name, v in dataclasses.asdict(self).items()}
+        return {name: None if value == math.inf else value for name, value in dataclasses.asdict(self).items()}
 
     @classmethod
     def from_dict(cls, numbers: dict[str, Any]) -> "ResponseSummary":
         """The summary that `to_dict` has written."""
-        return cls(**{name: math.inf if value is None else value for name, value in numbers.items()})
+        restored: dict[str, Any] = {name: math.inf if value is None else value for name, value in numbers.items()}
+        return cls(**restored)
 
 
 NO_RESPONSE = ResponseSummary(
@@ -48,34 +49,68 @@ NO_RESPONSE = ResponseSummary(
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Requirement:
-    """The wanted response of one axis or of the position."""
+class AxisLimits:
+    """What one axis, or the position, may show at most."""
+
+    axis: str = "position"
+    overshoot: float = 0.05  # at most, fraction of the step, median of the trials
+    error: float = 0.01  # at most, m (rad for yaw), median of the trials
+    percentile: float = 50.0  # of the trials, for the settling time
+
+    def tightened(self) -> Self:
+        """The limits on the training set: 80 % of the bounds."""
+        return dataclasses.replace(self, overshoot=TRAINING_BOUNDS * self.overshoot, error=TRAINING_BOUNDS * self.error)
+
+    def __str__(self) -> str:
+        error = f"{math.degrees(self.error):.3g} deg" if self.axis == "yaw" else f"{1e3 * self.error:.3g} mm"
+        return f"overshoot at most {100 * self.overshoot:g} %, error at most {error}"
+
+    @property
+    def trial(self) -> str:
+        """Which trial the settling time is taken of."""
+        return "median trial" if self.percentile == 50 else f"percentile {self.percentile:g} of the trials"
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Requirement(AxisLimits):
+    """The wanted response of one axis or of the position, and what further axes may show at most.
+
+    The settling time is that of the leading axis, `axis`. The `others` settle no later.
+    """
 
     settling_time: float  # s
     tolerance: float = 0.1  # allowed deviation, as a share of the settling time
     at_most: bool = False  # the settling time is an upper bound, not a target
-    overshoot: float = 0.05  # at most, fraction of the step, median of the trials
-    error: float = 0.01  # at most, m (rad for yaw), median of the trials
     settled: float = 0.99  # at least, share of the trials
-    axis: str = "position"
-    percentile: float = 50.0  # of the trials, for the settling time
+    others: tuple[AxisLimits, ...] = ()
+
+    def limits(self, axis: str) -> AxisLimits:
+        """The limits of an axis that is asked for."""
+        return next((each for each in self.others if each.axis == axis), self)
+
+    def axis_of(self, measure: str, response: ResponseSummary) -> str:
+        """The axis that a measure of a response belongs to."""
+        return response.axes.get(measure, self.axis)
+
+    def limit(self, measure: Literal["overshoot", "error"], response: ResponseSummary) -> float:
+        """The bound of a measure on the axis that the response has it of."""
+        return getattr(self.limits(self.axis_of(measure, response)), measure)
 
     def maximum_settling_time(self) -> float:
         """The longest settling time in s that still meets the requirement."""
         return self.settling_time * (1.0 if self.at_most else 1.0 + self.tolerance)
 
-    def tightened(self) -> "Requirement":
+    def tightened(self) -> Self:
         """The requirement on the training set: half of the tolerance and 80 % of the bounds.
 
         A policy that meets it usually meets the requirement itself on other initial conditions too.
         """
         tolerance = TRAINING_TOLERANCE * self.tolerance
         return dataclasses.replace(
-            self,
+            super().tightened(),
             settling_time=self.settling_time * (1.0 - tolerance if self.at_most else 1.0),
             tolerance=tolerance,
-            overshoot=TRAINING_BOUNDS * self.overshoot,
-            error=TRAINING_BOUNDS * self.error,
+            others=tuple(each.tightened() for each in self.others),
         )
 
     def aim(self) -> float:
@@ -92,19 +127,35 @@ class Requirement:
         def all_of(values: Callable[[Judgement], np.ndarray]) -> np.ndarray:
             return np.concatenate([values(judgement) for judgement in judgements])
 
-        times = all_of(lambda judged: judged.settling_time[self.axis])
-        stepped = all_of(lambda judged: judged.overshoot[self.axis])
-        stepped = stepped[~np.isnan(stepped)]
+        asked: tuple[AxisLimits, ...] = (self, *self.others)
+        times = {each.axis: all_of(lambda judged, axis=each.axis: judged.settling_time[axis]) for each in asked}
+        measured: dict[str, dict[str, float]] = {"settling_time": {}, "overshoot": {}, "error": {}}
+        for each in asked:
+            stepped = all_of(lambda judged, axis=each.axis: judged.overshoot[axis])
+            stepped = stepped[~np.isnan(stepped)]
+            errors = all_of(lambda judged, axis=each.axis: judged.steady_state_error[axis])
+            measured["settling_time"][each.axis] = _quantile(times[each.axis], each.percentile / 100)
+            measured["overshoot"][each.axis] = _quantile(stepped, 0.5) if stepped.size else 0.0
+            measured["error"][each.axis] = _quantile(errors, 0.5)
+        axes = {measure: self._worst_axis(measure, values) for measure, values in measured.items()}
         feasible = ~all_of(lambda judged: judged.infeasible)
         crossed = [all_of(lambda judged, name=name: judged.violated[name]) for name in constraints]
-        broken = np.logical_or.reduce([np.zeros(len(times), bool), *crossed])
+        broken = np.logical_or.reduce([np.zeros(len(feasible), bool), *crossed])
         return ResponseSummary(
-            settling_time=_quantile(times, self.percentile / 100),
-            overshoot=_quantile(stepped, 0.5) if stepped.size else 0.0,
-            error=_quantile(all_of(lambda judged: judged.steady_state_error[self.axis]), 0.5),
-            settled=float(np.mean(np.isfinite(times))),
+            **{measure: values[axes[measure]] for measure, values in measured.items()},
+            settled=float(np.mean(np.logical_and.reduce([np.isfinite(each) for each in times.values()]))),
             constraints_satisfied=float(1 - np.mean(broken[feasible])) if feasible.any() else 1.0,
+            axes={measure: axis for measure, axis in axes.items() if axis != self.axis},
         )
+
+    def _worst_axis(self, measure: str, values: Mapping[str, float]) -> str:
+        """The axis that exceeds its bound of a measure most; the leading one where none does."""
+        if measure == "settling_time":
+            late = [axis for axis, value in values.items() if value > self.maximum_settling_time()]
+            return max(late, key=lambda axis: values[axis], default=self.axis)
+        excess = {axis: values[axis] / max(getattr(self.limits(axis), measure), 1e-3) for axis in values}
+        worst = max(excess, key=lambda axis: excess[axis])
+        return worst if values[worst] > getattr(self.limits(worst), measure) else self.axis
 
     def misses(self, response: ResponseSummary) -> dict[str, float]:
         """Measure -> by how much it misses its bound; empty where the requirement is met.
@@ -120,10 +171,10 @@ class Requirement:
         ratio = response.settling_time / self.settling_time
         if response.settling_time > self.maximum_settling_time() or (not self.at_most and ratio < 1 - self.tolerance):
             found["settling_time"] = _log(response.settling_time / self.aim())
-        if response.overshoot > self.overshoot:
-            found["overshoot"] = min(response.overshoot - self.overshoot, LARGEST_MISS)
-        if response.error > self.error:
-            found["error"] = _log(response.error / self.error)
+        if (excess := response.overshoot - self.limit("overshoot", response)) > 0:
+            found["overshoot"] = min(excess, LARGEST_MISS)
+        if response.error > (most := self.limit("error", response)):
+            found["error"] = _log(response.error / most)
         return found
 
     def weighted_misses(self, response: ResponseSummary) -> dict[str, float]:
@@ -140,15 +191,14 @@ class Requirement:
         return sum(self.weighted_misses(response).values())
 
     def __str__(self) -> str:
-        degrees = self.axis == "yaw"
-        error = f"{math.degrees(self.error):.3g} deg" if degrees else f"{1e3 * self.error:.3g} mm"
         tolerance = f"+- {100 * self.tolerance:g} %"
         time = f"at most {self.settling_time:g} s" if self.at_most else f"{self.settling_time:g} s {tolerance}"
-        name = "median trial" if self.percentile == 50 else f"percentile {self.percentile:g} of the trials"
-        return (
-            f"{self.axis} settles in {time} ({name}), overshoot at most {100 * self.overshoot:g} %, "
-            f"error at most {error} (both in the median), {100 * self.settled:g} % of the trials settle"
+        text = (
+            f"{self.axis} settles in {time} ({self.trial}), {super().__str__()} (both in the median), "
+            f"{100 * self.settled:g} % of the trials settle"
         )
+        others = (f"; {each.axis} settles no later ({each.trial}), {each}" for each in self.others)
+        return text + "".join(others)
 
 
 def constraints_of(task: Task, edits: Collection[str]) -> tuple[str, ...]:
@@ -160,66 +210,6 @@ def constraints_of(task: Task, edits: Collection[str]) -> tuple[str, ...]:
     )
 
 
-def make_requirement(
-    settling_time: float,
-    overshoot: float = 5.0,
-    error: float | None = None,
-    *,
-    at_most: bool = False,
-    tolerance: float = 10.0,
-    axis: str = "position",
-    percentile: float = 50.0,
-) -> Requirement:
-    """The requirement in the units of the judge, from numbers in the units of the command line.
-
-    Args:
-        settling_time: wanted settling time in s.
-        overshoot: largest allowed median overshoot in percent of the step.
-        error: largest allowed median steady-state error in m, in deg for yaw; 0.01 m or 1 deg where None.
-        at_most: the settling time is an upper bound, not a target.
-        tolerance: allowed deviation from the settling time in percent.
-        axis: position, x, y, z or yaw.
-        percentile: percentile of the trials at which the settling time is taken.
-
-    Raises:
-        BadInput: a number is out of range, or seems to be in another unit.
-    """
-
-    def fraction_hint(value: float) -> str:
-        return f" Did you mean {100 * value:g}?" if 0 < value < 1 else ""
-
-    if axis not in AXES:
-        raise BadInput(f"axis: {axis!r} is not allowed. Allowed: {', '.join(AXES)}.")
-    hint = f" Did you mean {settling_time / 1000:g} (seconds, not milliseconds)?" if settling_time >= 200 else ""
-    _check("settling-time", settling_time, 0.2, LONGEST, "s", hint)
-    if 0 < overshoot < 0.5:
-        raise BadInput(
-            f"overshoot: {overshoot:g} is not allowed. Allowed: 0, or 0.5 to 100 %. "
-            f"Did you mean {100 * overshoot:g} (percent of the step, not a fraction)?"
-        )
-    _check("overshoot", overshoot, 0.0, 100.0, "%")
-    band = math.degrees(YAW_BAND) if axis == "yaw" else POSITION_BAND
-    unit, smallest, largest = ("deg", 0.02, round(band, 9)) if axis == "yaw" else ("m", 0.0002, band)
-    if error is None:
-        error = 1.0 if axis == "yaw" else 0.01
-    millimetres = axis != "yaw" and 1 <= error <= 20
-    hint = f" Did you mean {error / 1000:g} (metres, not millimetres)?" if millimetres else ""
-    if error > largest:
-        hint = hint or f" Beyond {largest:g} {unit} a trial does not count as settled."
-    _check("error", error, smallest, largest, unit, hint)
-    _check("tolerance", tolerance, 2.0, 50.0, "%", fraction_hint(tolerance))
-    _check("percentile", percentile, 1.0, 99.0, "%", fraction_hint(percentile))
-    return Requirement(
-        settling_time=float(settling_time),
-        tolerance=tolerance / 100,
-        at_most=at_most,
-        overshoot=overshoot / 100,
-        error=math.radians(error) if axis == "yaw" else float(error),
-        axis=axis,
-        percentile=float(percentile),
-    )
-
-
 def _log(ratio: float) -> float:
     return LARGEST_MISS if math.isinf(ratio) else max(-LARGEST_MISS, min(LARGEST_MISS, math.log(max(ratio, 1e-6))))
 
@@ -227,8 +217,3 @@ def _log(ratio: float) -> float:
 def _quantile(values: np.ndarray, share: float) -> float:
     found = quantile(values, share)
     return math.inf if found is None else found
-
-
-def _check(name: str, value: float, smallest: float, largest: float, unit: str, hint: str = "") -> None:
-    if not (math.isfinite(value) and smallest <= value <= largest):
-        raise BadInput(f"{name}: {value:g} is not allowed. Allowed: {smallest:g} to {largest:g} {unit}.{hint}")

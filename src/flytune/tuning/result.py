@@ -34,7 +34,8 @@ class Tuning:
 
     def why(self) -> str:
         """What misses the requirement in the best iteration, and why no further edit was made, in one line."""
-        misses = describe_misses(self.last_validation.misses if self.last_validation else {}, self.requirement)
+        last = self.last_validation
+        misses = describe_misses(last.misses, self.requirement, last.axes) if last else "met"
         reasons = "; ".join(self.stopped_because) or "no rule applies"
         return (
             f"{misses} (iteration {self.best}). The tuning stopped: {reasons}. The best policy is in {self.directory}."
@@ -62,7 +63,7 @@ class Tuning:
                 {
                     "number": each.number,
                     "parent": each.parent,
-                    "edit": describe_edit(each.edit, target) if each.edit else f"start: {self.start}",
+                    "edit": describe_edit(each.edit) if each.edit else f"start: {self.start}",
                     "result": describe_iteration(each, before, target, bounds=bool(self.constraints)),
                     "change": dataclasses.asdict(each.edit) if each.edit else None,
                     "seconds": each.seconds,

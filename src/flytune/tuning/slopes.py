@@ -35,6 +35,10 @@ class Context:
         """Whether the sensitivities were measured with this trainer; only then they can rule an edit out."""
         return self.trainer == self.sensitivities.facts["trainer"]
 
+    def axis_of(self, measure: str, iteration: Iteration) -> str:
+        """The axis that a measure of an iteration belongs to."""
+        return self.requirement.axis_of(measure, iteration.response)
+
 
 @dataclasses.dataclass(frozen=True)
 class Slope:
@@ -52,7 +56,7 @@ def find_slope(context: Context, rule: Rule, value: float, iteration: Iteration)
         NotUsed: the measured effect there is zero, or opposite to that of the rule.
     """
     up = rule.direction == "up"
-    known, what = context.sensitivities, (rule.field, rule.measure, value, context.requirement.axis, up)
+    known, what = context.sensitivities, (rule.field, rule.measure, value, context.axis_of(rule.measure, iteration), up)
     measured = known.slope(*what) if rule.measure in MEASURES else None
     confirmed = measured is not None and measured * rule.slope > 0 and known.is_significant(*what)
     found = []

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from flytune.config import document
+from flytune.config import document, nested
 from flytune.control.policy import Policy, load_policy
 from flytune.errors import BadInput
 from flytune.evaluation.judge import Judgement
@@ -18,11 +18,12 @@ from flytune.tuning.dial_start import DIAL, find_setting
 from flytune.tuning.feasibility import check_feasible
 from flytune.tuning.flying import fly_for, hover_flights
 from flytune.tuning.history import TRAINING_SEED, TRAINING_TRIALS
-from flytune.tuning.requirement import Requirement, ResponseSummary
+from flytune.tuning.requirement import Requirement, ResponseSummary, constraints_of
 from flytune.tuning.rules import edited, is_fixed
 
 KNOWN = ("acrobatic-refined", "baseline-refined", "inspection-refined")  # fastest first
 WITHOUT_POLICY = "baseline-refined"  # the task to begin with where no known policy settles
+OF_TRAINING = ("name", "sources", "duration", "horizon", "dial", "follow", "input", "apg", "ppo")  # how it is learned
 SLOW = 4.0  # s; for longer settling times the window of a training is 5 s
 
 
@@ -33,8 +34,10 @@ class Start:
     name: str
     task: Task  # with the user's fields and the settings for a warm start
     first: Task  # the same, with the settings for a training from new weights
-    policy: Policy | None  # None where none is known
-    record: Path | None  # run.json of its training
+    policy: Policy | None  # None where none is known for this task, which is then trained first
+    initial: Policy | None  # the policy whose weights that first training starts from; None: from new weights
+    trained_for: str  # a field in which the task of the nearest known policy differs, empty where in none
+    record: Path | None  # run.json of the training of the policy
     setting: Mapping[str, float]  # of the dial that the policy was made from; empty without one
     judgement: Judgement | None  # of the policy on the training set
     times: Mapping[str, float]  # known task -> settling time in s of its policy, with the user's fields
@@ -84,17 +87,42 @@ def find_start(requirement: Requirement, wanted: str | None, edits: Mapping[str,
         ratio = abs(math.log(max(times[known], 1e-3) / requirement.aim()))
         if ratio < smallest:
             smallest, name, (policy, record), judgement = ratio, known, found, judged
+    nearest, other = policy, []
+    if edits and name in (DIAL, *KNOWN):
+        flown = dialled.family if dialled is not None and name == DIAL else tasks[name]
+        other = _other_fields(load_task(name), flown)
+        if judgement is not None and other:
+            response = requirement.measure(judgement, constraints=constraints_of(tasks[name], edits))
+            if requirement.misses(response) or any(field.startswith("reward.") for field in other):
+                policy = record = judgement = None
+    same_vehicle = not any(field.startswith("vehicle.") for field in other)
+    warm = policy is None and same_vehicle and find_trainer(trainer).supports_warm_start
     task = dataclasses.replace(tasks[name], name=f"{tasks[name].name}-tuned-{requirement.settling_time:g}s")
     return Start(
         name=name,
         task=_prepared(task, requirement, trainer, True, tuple(edits)),
         first=_prepared(task, requirement, trainer, False, tuple(edits)),
         policy=policy,
+        initial=nearest if warm else None,
+        trained_for=other[0] if policy is None and other else "",
         record=record,
         setting=dialled.setting if dialled is not None and name == DIAL else {},
         judgement=judgement,
         times=times,
     )
+
+
+def _other_fields(trained: Task, wanted: Task) -> list[str]:
+    """In which fields two tasks differ, of those that are flown or rewarded: the first one of each part, vehicle first.
+
+    Fields that follow a dial are left out: the dial sets them.
+    """
+    one, other = document.plain(trained), document.plain(wanted)
+    for path in trained.follow:
+        other = nested.edit(other, path, nested.look_up(one, path))
+    parts = ["vehicle", *(key for key in one if key not in (*OF_TRAINING, "vehicle"))]
+    differences = (nested.first_difference({part: one[part]}, {part: other[part]}) for part in parts)
+    return [path for path in differences if path]
 
 
 def _time(response: ResponseSummary) -> float:

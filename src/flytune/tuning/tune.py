@@ -11,9 +11,10 @@ from flytune.report.tuning import write_tuning
 from flytune.runs.directory import new_directory
 from flytune.training.progress import Progress
 from flytune.training.trainer import DEFAULT_TRAINER, find_trainer
+from flytune.tuning.asked import OVERSHOOT, PERCENTILE, PerAxis, make_requirement
 from flytune.tuning.loop import Tuner
 from flytune.tuning.messages import line
-from flytune.tuning.requirement import Requirement, make_requirement
+from flytune.tuning.requirement import Requirement
 from flytune.tuning.result import Tuning
 from flytune.tuning.rules import Rule, load_rules
 
@@ -21,10 +22,10 @@ from flytune.tuning.rules import Rule, load_rules
 def tune(
     settling_time: float,
     *,
-    overshoot: float = 5.0,
-    error: float | None = None,
-    axis: str = "position",
-    percentile: float = 50.0,
+    overshoot: PerAxis = OVERSHOOT,
+    error: PerAxis | None = None,
+    axis: str | Sequence[str] = "position",
+    percentile: PerAxis = PERCENTILE,
     at_most: bool = False,
     tolerance: float = 10.0,
     task: str | None = None,
@@ -45,11 +46,12 @@ def tune(
 
     Args:
         settling_time: wanted settling time in s.
-        overshoot: largest allowed overshoot in percent of the step, median of the trials.
-        error: largest allowed steady-state error, median of the trials, in m (in deg for yaw); 0.01 m or 1 deg where
-            None.
-        axis: whose response: position, x, y, z or yaw.
-        percentile: percentile of the trials at which the settling time is taken.
+        overshoot: largest allowed overshoot in percent of the step, median of the trials; or axis -> percent.
+        error: largest allowed steady-state error, median of the trials, in m (in deg for yaw), or axis -> error; 0.01 m
+            and 1 deg where None.
+        axis: whose response: position, x, y, z or yaw; of several, the first settles in the time asked for, and the
+            others settle no later.
+        percentile: percentile of the trials at which the settling time is taken; or axis -> percentile.
         at_most: whether the settling time is an upper bound instead of a target.
         tolerance: allowed deviation from the settling time in percent.
         task: the task to begin with, a preset or a TOML file; the known task whose policy settles nearest where None.
