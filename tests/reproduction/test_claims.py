@@ -1,6 +1,7 @@
 """Claims on evidence made by hand, where the verdict is known beforehand."""
 
 import dataclasses
+import re
 
 import numpy as np
 import pytest
@@ -77,6 +78,54 @@ def test_seeds_that_end_apart_have_no_small_variance(make_evidence):
     apart = {behaviour: [curve(100.0), curve(120.0)] for behaviour in BEHAVIOURS}
     assert verdict(make_evidence(ORDERED, curves=apart), "R27-variance") == "does not hold"
     assert verdict(make_evidence(ORDERED), "R27-variance") == "holds under a reading"
+
+
+def claim_of(evidence, item):
+    (claim,) = judge_claims(evidence, [item])
+    return claim
+
+
+def test_one_seed_says_nothing_of_the_variance_over_seeds(make_evidence):
+    alone = {behaviour: [curve(100.0)] for behaviour in BEHAVIOURS}
+    claim = claim_of(make_evidence(ORDERED, curves=alone), "R27-variance")
+    assert claim.verdict == "cannot be tested with this study"
+    assert claim.why.startswith("One seed has no variance over seeds.")
+    # of one behaviour alone a spread is known, and it is too large: that is enough to refute
+    some = {**alone, "baseline": [curve(100.0), curve(120.0)]}
+    assert verdict(make_evidence(ORDERED, curves=some), "R27-variance") == "does not hold"
+
+
+@pytest.mark.parametrize("item", ["R27-variance", "R28"])
+def test_trainings_in_which_no_episode_ended_say_nothing_of_the_reward(make_evidence, item):
+    silent = [{**row, "episode_reward": None} for row in curve(100.0)]
+    evidence = make_evidence(ORDERED, curves={behaviour: [silent, silent] for behaviour in BEHAVIOURS})
+    claim = claim_of(evidence, item)
+    assert claim.verdict == "cannot be tested with this study"
+    assert claim.why.startswith("No episode ended in the last tenth of a training")
+
+
+@pytest.mark.parametrize(("steps", "testable"), [(500_000, False), (5_900_000, False), (6_100_000, True), (None, True)])
+def test_shorter_trainings_than_those_of_the_paper_refute_and_confirm_nothing(make_evidence, steps, testable):
+    evidence = make_evidence(ORDERED)
+    evidence = dataclasses.replace(evidence, study=dataclasses.replace(evidence.study, steps=steps))
+    found = {claim.item: claim for claim in judge_claims(evidence)}
+    untestable = {item for item, claim in found.items() if claim.verdict == "cannot be tested with this study"}
+    of_measures = {item for item in found if not item.startswith("H") and item != "R26"}
+    assert untestable == (set() if testable else of_measures)
+    if not testable:
+        assert re.match(r"The trainings ended after [\d,]+ environment steps of 6,0\d\d,\d\d\d\. ", found["R28"].why)
+
+
+def test_trials_of_which_none_counts_decide_nothing(make_evidence, change_response):
+    evidence = make_evidence(ORDERED)
+    responses = dict(evidence.responses)
+    for key, response in evidence.responses.items():
+        judged = response.judgements[0]
+        none = dataclasses.replace(judged, infeasible=np.ones_like(judged.infeasible))
+        responses[key] = change_response(response, [none, none])
+    claim = claim_of(dataclasses.replace(evidence, responses=responses), "R29-settling")
+    assert claim.verdict == "cannot be tested with this study"
+    assert claim.why.startswith("No trial counts.")
 
 
 def test_a_reward_that_still_rises_has_not_saturated(make_evidence):

@@ -115,6 +115,7 @@ def test_verdicts_are_plain_values():
         "high": 0.6,
         "unit": "share",
         "agrees": False,
+        "missing": "",
     }
 
 

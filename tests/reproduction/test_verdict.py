@@ -47,11 +47,13 @@ def test_a_median_in_which_most_trials_failed_is_no_number():
         ([], [YES], "holds under a reading"),
         ([NO], [YES, NO], "does not hold"),
         ([NO], [], "does not hold"),
-        ([], [], "does not hold"),
-        ([], [INFORMS], "does not hold"),
+        ([NO], [YES, INFORMS], "cannot be tested with this study"),
+        ([NO], [NO, INFORMS], "does not hold"),
+        ([], [], "cannot be tested with this study"),
+        ([], [INFORMS], "cannot be tested with this study"),
     ],
 )
-def test_a_claim_holds_as_printed_or_under_a_reading_or_not(printed, reading, verdict):
+def test_a_claim_holds_as_printed_or_under_a_reading_or_not_or_was_not_measured(printed, reading, verdict):
     assert decide(printed, reading) == verdict
 
 

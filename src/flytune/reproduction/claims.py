@@ -16,6 +16,8 @@ from flytune.reproduction.evidence import Evidence, Weights
 from flytune.reproduction.measures import ClaimMeasures
 from flytune.reproduction.study import BEHAVIOURS
 from flytune.reproduction.verdict import JudgedClaim, Measure, decide
+from flytune.task.files import load_task
+from flytune.training.trainer import find_trainer
 
 MEASURES: dict[str, Callable[[Evidence, Weights], ClaimMeasures]] = {
     "R23-damping": measures.damping,
@@ -45,16 +47,35 @@ def judge_claims(evidence: Evidence, items: Collection[str] | None = None) -> li
 
 def _claim(evidence: Evidence, item: str, text: dict[str, Any]) -> JudgedClaim:
     last = MEASURES[item](evidence, "last")
-    reason = text.get("untestable")
+    verdict, reason = decide(last.printed, last.reading), ""
+    if "untestable" in text:
+        verdict, reason = "cannot be tested as printed", text["untestable"]
+    elif short := _too_short(evidence):
+        verdict, reason = "cannot be tested with this study", short
+    elif verdict == "cannot be tested with this study":
+        missing = (measure.missing for measure in last.reading or last.printed)
+        reason = next((each for each in missing if each), "nothing was measured")
     return JudgedClaim(
         item=item,
         claim=text["claim"],
-        verdict="cannot be tested as printed" if reason else decide(last.printed, last.reading),
+        verdict=verdict,
         reading=text["reading"],
         why=f"{reason[0].upper()}{reason[1:]}. {text['why']}" if reason else text["why"],
         measures=last.all(),
         averaged=[] if item in OF_TRAINING else MEASURES[item](evidence, "averaged").all(),
     )
+
+
+def _too_short(evidence: Evidence) -> str:
+    """Why no claim can be tested on trainings that were shorter than those of the task; empty where they were not."""
+    study = evidence.study
+    settings = find_trainer(study.trainer).settings
+    for behaviour in BEHAVIOURS:
+        trained, meant = settings(study.task(behaviour)), settings(load_task(study.preset(behaviour)))
+        if trained.updates < meant.updates:
+            steps, wanted = (each.updates * each.steps_per_update for each in (trained, meant))
+            return f"the trainings ended after {steps:,} environment steps of {wanted:,}"
+    return ""
 
 
 def _heuristic(evidence: Evidence, item: str, text: dict[str, Any]) -> JudgedClaim:

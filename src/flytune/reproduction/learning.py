@@ -15,6 +15,8 @@ Rows = Sequence[Mapping[str, Any]]
 SMOOTH = 0.1  # of a training: the share of its updates a smoothed reward is the mean of
 SURVIVES = 0.9  # of the horizon
 SURVIVAL = 700e3  # steps (R27)
+ONE_SEED = "one seed has no variance over seeds"
+NO_EPISODE = "no episode ended in the last tenth of a training, so that it has no last reward"
 
 
 def column(rows: Rows, name: str) -> np.ndarray:
@@ -56,9 +58,13 @@ def variance(evidence: Evidence, weights: Weights) -> ClaimMeasures:
     rows = []
     for behaviour in BEHAVIOURS:
         final = np.array([reward_at(curve, 1.0) for curve in evidence.curves[behaviour]])
-        spread = float(np.std(final, ddof=1) / abs(np.mean(final))) if final.size > 1 else None
         what = f"{behaviour}: standard deviation over seeds of the last episode reward, over its mean"
-        rows.append(Measure(what=what, value=spread, unit="share", agrees=spread is not None and spread <= 0.05))
+        missing = NO_EPISODE if np.any(np.isnan(final)) else ONE_SEED if final.size < 2 else ""
+        if missing:
+            rows.append(Measure(what=what, value=None, unit="share", missing=missing))
+            continue
+        spread = float(np.std(final, ddof=1) / abs(np.mean(final)))
+        rows.append(Measure(what=what, value=spread, unit="share", agrees=spread <= 0.05))
     return ClaimMeasures(reading=rows)
 
 
@@ -93,6 +99,9 @@ def _survival(evidence: Evidence, behaviour: str) -> Measure:
 
 def efficiency(evidence: Evidence, weights: Weights) -> ClaimMeasures:
     """R28: how soon each behaviour earns nearly all it ever earns, and how much it still gains at the end."""
+    ends = [reward_at(curve, at) for curves in evidence.curves.values() for curve in curves for at in (0.8, 1.0)]
+    if np.any(np.isnan(ends)):
+        return ClaimMeasures(reading=[Measure(what="episode reward at the end", value=None, missing=NO_EPISODE)])
     needed = {
         behaviour: [steps_to_share(curve, 0.95) for curve in evidence.curves[behaviour]] for behaviour in BEHAVIOURS
     }

@@ -15,8 +15,10 @@ from flytune.reproduction.study import BEHAVIOURS
 from flytune.reproduction.verdict import JudgedClaim, Measure, Verdict
 from flytune.tables import Cell, Table
 
-TONES: dict[Verdict, str] = dict(zip(get_args(Verdict), ("good", "fair", "bad", "unknown"), strict=True))
-PLURALS = ("hold", "hold under a reading", "do not hold", "cannot be tested as printed")
+TONES: dict[Verdict, str] = dict(zip(get_args(Verdict), ("good", "fair", "bad", "unknown", "unknown"), strict=True))
+PLURALS = (
+    "hold", "hold under a reading", "do not hold", "cannot be tested as printed", "cannot be tested with this study"
+)  # fmt: skip
 AGREES = {True: "yes", False: "no", None: ""}
 
 
@@ -24,7 +26,11 @@ def summary(claims: Sequence[JudgedClaim]) -> str:
     """How many claims there are of each verdict, in one sentence."""
     counts = Counter(claim.verdict for claim in claims)
     plurals = zip(get_args(Verdict), PLURALS, strict=True)
-    parts = [f"{counts[verdict]} {verdict if counts[verdict] == 1 else plural}" for verdict, plural in plurals]
+    parts = [
+        f"{counts[verdict]} {verdict if counts[verdict] == 1 else plural}"
+        for verdict, plural in plurals
+        if counts[verdict] or verdict != "cannot be tested with this study"
+    ]
     return f"Of {len(claims)} claims, {', '.join(parts[:-1])} and {parts[-1]}."
 
 
@@ -41,7 +47,7 @@ def verdict_table(claims: Sequence[JudgedClaim], columns: Sequence[str] = ("verd
 
 def measure_table(measures: Sequence[Measure], title: str = "measured") -> Table:
     """The numbers behind a verdict, and whether each agrees with the claim."""
-    rows = [(measure.what, measure.text(), AGREES[measure.agrees]) for measure in measures]
+    rows = [(measure.what, measure.missing or measure.text(), AGREES[measure.agrees]) for measure in measures]
     return Table.plain((title, "value [95 % interval]", "agrees"), rows, style="stacked")
 
 

@@ -9,7 +9,9 @@ from jaxtyping import Shaped
 
 from flytune.evaluation.statistics import bootstrap_interval, median
 
-Verdict = Literal["holds", "holds under a reading", "does not hold", "cannot be tested as printed"]
+Verdict = Literal[
+    "holds", "holds under a reading", "does not hold", "cannot be tested as printed", "cannot be tested with this study"
+]
 
 # Fixed before anything was measured: a claim about trials holds where the lower end of the interval of the share of
 # trials that agree with it reaches this.
@@ -25,7 +27,8 @@ class Measure:
     low: float | None = None
     high: float | None = None
     unit: str = "1"
-    agrees: bool | None = None  # with the claim; None where the number only informs
+    agrees: bool | None = None  # with the claim; None where the number only informs, or is missing
+    missing: str = ""  # why there is nothing to measure
 
     def text(self) -> str:
         """The number with its unit and its interval."""
@@ -66,7 +69,7 @@ def share_of_trials(
     """
     values = [np.asarray(group, float) for group in agreeing if len(group)]
     if not values:
-        return Measure(what=what, value=None, unit="share", agrees=None)
+        return Measure(what=what, value=None, unit="share", missing="no trial counts")
     low, high = bootstrap_interval(values, lambda drawn: float(np.mean(drawn)))
     value = float(np.mean(np.concatenate(values)))
     agrees = None if threshold is None else low is not None and low >= threshold
@@ -83,10 +86,11 @@ def decide(printed: Sequence[Measure], reading: Sequence[Measure] = ()) -> Verdi
     """The verdict that the measures of a claim lead to.
 
     `holds` where every measure taken as printed agrees, `holds under a reading` where every measure of the reading
-    does, `does not hold` otherwise.
+    does. Otherwise it does not hold, unless nothing disagrees: then it is a measure that is missing.
     """
     if printed and all(measure.agrees for measure in printed):
         return "holds"
     if reading and all(measure.agrees for measure in reading):
         return "holds under a reading"
-    return "does not hold"
+    disagrees = any(measure.agrees is False for measure in reading or printed)
+    return "does not hold" if disagrees else "cannot be tested with this study"
