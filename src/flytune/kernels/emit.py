@@ -110,7 +110,9 @@ class Emitter:
         if renamed is not None:
             return renamed
         if name in REDUCTIONS or name in ("argmin", "argmax"):
-            return [self._reduce(name, parameters["axes"], inputs[0], kinds[0].dtype, out.shape)]
+            return [
+                self._reduce(name, [int(axis) for axis in parameters["axes"]], inputs[0], kinds[0].dtype, out.shape)
+            ]
         if name == "dot_general":
             return [self._product(parameters["dimension_numbers"], inputs[0], inputs[1], out.shape)]
         types = [kind.dtype for kind in kinds]
