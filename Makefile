@@ -1,6 +1,7 @@
 # make demo    three responses of one policy (three-responses.html); then train a controller, write report.html
 # make test    the test suite        make test-slow   the trainings it leaves out
 # make test-sb3  the tests that need PyTorch (a large download)
+# make test-floor  a few tests of every extra, with the lowest versions that pyproject.toml allows
 # make test-busy  the test suite while every core is kept busy: no test may depend on the speed of the machine
 # make docs    the documentation as a site, build/docs
 # make check   lint, types, layers   make pins        renew the pinned requirements
@@ -11,7 +12,7 @@ WORKERS ?= 2
 PYTEST := $(BIN)/python -m pytest -n $(WORKERS) --dist loadfile
 export PIP_DISABLE_PIP_VERSION_CHECK = 1
 
-.PHONY: demo test test-busy test-slow test-sb3 check docs pins clean
+.PHONY: demo test test-busy test-slow test-sb3 test-floor check docs pins clean
 
 demo: .venv/base.stamp
 	@$(BIN)/flytune report dial@settling_time=2.5 dial@settling_time=5 dial@settling_time=10 --duration 20 \
@@ -38,6 +39,13 @@ TORCH ?= torch==2.13.0
 test-sb3: .venv/sb3.stamp
 	$(PYTEST) tests/sb3 tests/test_docs.py
 
+# an import that fails would only skip its tests, so all are imported first
+FLOOR := .venv-floor
+test-floor: $(FLOOR)/stamp
+	$(FLOOR)/bin/python -c "import gymnasium, mujoco, onnxruntime, optuna, pybullet, stable_baselines3, tensorboard"
+	$(FLOOR)/bin/python -m pytest -n $(WORKERS) --dist loadfile -m floor
+	$(FLOOR)/bin/python -m sphinx -W --keep-going -q docs build/docs-floor
+
 check: .venv/dev.stamp
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
@@ -63,6 +71,15 @@ docs: .venv/dev.stamp
 	$(BIN)/python -m pip install --quiet --no-deps --require-hashes -r requirements/sb3.txt
 	touch $@
 
+# each `name>=version` of pyproject.toml as the constraint `name==version`
+$(FLOOR)/stamp: pyproject.toml
+	rm -rf $(FLOOR) && $(PYTHON) -m venv $(FLOOR)
+	grep -oE '"[a-z0-9-]+>=[0-9.]+"' pyproject.toml | sed 's/"//g; s/>=/==/' | sort -u > $(FLOOR)/lowest.txt
+	$(FLOOR)/bin/python -m pip install --quiet -c $(FLOOR)/lowest.txt setuptools wheel
+	$(FLOOR)/bin/python -m pip install --quiet -c $(FLOOR)/lowest.txt --no-build-isolation "$(TORCH)" \
+		pytest pytest-xdist hypothesis beartype -e ".[build,docs,gymnasium,mujoco,onnx,optuna,pybullet,sb3,tensorboard]"
+	touch $@
+
 PIN := $(BIN)/pip-compile --quiet --generate-hashes --allow-unsafe --strip-extras --no-header --no-annotate \
        --no-emit-index-url --no-emit-trusted-host --no-emit-find-links --no-emit-options
 EXTRAS := $(foreach extra,build dev docs gymnasium mujoco onnx optuna pybullet tensorboard,--extra $(extra))
@@ -74,4 +91,4 @@ pins:
 		sha256sum "$$file" | sed -E 's/ .*//; s/^/    --hash=sha256:/'; done > ../../requirements/sb3.txt
 
 clean:
-	rm -rf .venv .jax_cache build runs report.html three-responses.html
+	rm -rf .venv .venv-floor .jax_cache build runs report.html three-responses.html

@@ -32,10 +32,11 @@ RULES = BeartypeConf(hint_overrides=FrozenDict({float: float | int | jax.Array, 
 def check_types(function):
     """The function with its types and shapes checked at each call.
 
-    Two kinds are left out: constructors, since JAX rebuilds our dataclasses with tracers in their numbers; and the
-    arguments of what a user calls from Python, since these functions refuse a bad argument in their own words.
+    Three kinds are left out: constructors, since JAX rebuilds our dataclasses with tracers in their numbers; the
+    package's own `__getattr__`, without which its names are not known yet; and the arguments of what a user calls from
+    Python, since these functions refuse a bad argument in their own words.
     """
-    if function.__name__ == "__init__":
+    if function.__name__ == "__init__" or function.__module__ == "flytune":
         return function
     if function.__qualname__ in import_module("flytune").__all__:
         hints = function.__annotations__

@@ -40,11 +40,19 @@ SHOWS = {
 
 EXTENDS = {"own_simulator"}  # it builds on flytune's own physics
 SLOW = {"own_reward_term"}  # it compiles a training of its own
+FLOOR = {"tune_to_a_response"}
 
 
 @pytest.mark.parametrize(
     "script",
-    [pytest.param(path, id=path.stem, marks=[pytest.mark.slow] * (path.stem in SLOW)) for path in EXAMPLES],
+    [
+        pytest.param(
+            path,
+            id=path.stem,
+            marks=[pytest.mark.slow] * (path.stem in SLOW) + [pytest.mark.floor] * (path.stem in FLOOR),
+        )
+        for path in EXAMPLES
+    ],
 )
 def test_the_example_runs_and_shows_what_it_promises(script, tmp_path):
     if script.stem in NEEDS:

@@ -16,9 +16,15 @@ Each command of the command line is one call here:
 JAX is imported with the first name that needs it, not with the package.
 """
 
-import lazy_loader
+from functools import cache
 
-_lazy_getattr, _lazy_dir, __all__ = lazy_loader.attach_stub(__name__, __file__)
+
+@cache
+def _interface():
+    """How to get a public name, how to list them, and the names."""
+    import lazy_loader
+
+    return lazy_loader.attach_stub(__name__, __file__)
 
 
 def __getattr__(name: str) -> object:
@@ -26,8 +32,13 @@ def __getattr__(name: str) -> object:
         from importlib.metadata import version
 
         return version("flytune")
-    return _lazy_getattr(name)
+    if name == "__all__":
+        return _interface()[2]
+    from flytune.errors import check_installed
+
+    check_installed()  # before the first name that is used imports a package which may be too old
+    return _interface()[0](name)
 
 
 def __dir__() -> list[str]:
-    return [*_lazy_dir(), "__version__"]
+    return [*_interface()[1](), "__version__"]

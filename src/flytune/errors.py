@@ -1,6 +1,9 @@
-"""The exceptions a user can meet, each with its exit code; and the import of optional packages, which may raise one."""
+"""The exceptions a user can meet, each with its exit code; and the checks of packages, which may raise one."""
 
+import re
+from functools import cache
 from importlib import import_module
+from importlib.util import find_spec
 from types import ModuleType
 
 
@@ -34,6 +37,51 @@ class Interrupted(FlytuneError):
     exit_code = 130
 
 
+@cache
+def check_installed(extra: str = "") -> None:
+    """Refuse packages that are older than flytune declares: pip keeps an old one that was put in later.
+
+    Args:
+        extra: the extra of flytune whose packages are checked; "" checks those that flytune always needs.
+
+    Raises:
+        BadInput: one is too old, or one that is always needed is missing; the line names the command that mends it.
+    """
+    from importlib.metadata import PackageNotFoundError, requires, version  # slow, and `flytune --help` does without
+
+    try:
+        declared = requires("flytune") or []
+    except PackageNotFoundError:
+        return  # a bare copy of the source declares nothing
+    wrong, remedy = [], []
+    for line in declared:
+        needed = re.fullmatch(r"([\w.-]+)>=([\d.]+)(?:; extra == [\"'](\w+)[\"'])?", line)
+        if needed is None or (needed[3] or "") != extra:
+            continue
+        name, lowest = needed[1], needed[2]
+        try:
+            found = version(name)
+        except PackageNotFoundError:
+            if extra or find_spec(name.replace("-", "_")):
+                continue  # `require` says which optional package is missing; and some are installed without metadata
+            wrong.append(f"{name} is not installed")
+        else:
+            if _release(found) >= _release(lowest):
+                continue
+            wrong.append(f"{name} {found} is too old, {lowest} or newer is needed")
+        remedy.append(f'"{name}>={lowest}"')
+    if wrong:
+        raise BadInput(f"{'; '.join(wrong)}. Install with: pip install {' '.join(remedy)}")
+
+
+def _release(version: str) -> tuple[int, ...]:
+    """The numbers of a version to compare by: (2, 13) for 2.13.0+cpu and for 2.13.0rc1."""
+    numbers = [int(number) for number in re.match(r"[\d.]*", version)[0].split(".") if number]  # pyright: ignore
+    while numbers and numbers[-1] == 0:
+        numbers.pop()
+    return tuple(numbers)
+
+
 def require(package: str, extra: str) -> ModuleType:
     """The module of an optional package.
 
@@ -42,8 +90,10 @@ def require(package: str, extra: str) -> ModuleType:
         extra: the extra of flytune that brings it, for instance `onnx`.
 
     Raises:
-        BadInput: it is not installed; the line names the command that installs it.
+        BadInput: it is not installed or too old; the line names the command that installs it.
     """
+    check_installed()
+    check_installed(extra)
     try:
         return import_module(package)
     except ModuleNotFoundError as error:

@@ -62,6 +62,7 @@ def test_check_env_finds_nothing_to_say(quiet, render_mode):
     check_env(gymnasium.make("flytune/Hover-v0", render_mode=render_mode).unwrapped)
 
 
+@pytest.mark.floor
 def test_an_episode_through_make_passes_the_passive_checker(quiet):
     env = gymnasium.make("flytune/Hover-v0", render_mode="rgb_array", edits={"horizon": 20})
     env.reset(seed=0)
@@ -97,6 +98,7 @@ def test_registering_twice_says_nothing(quiet):
     assert gymnasium.spec("flytune/Hover-v0").vector_entry_point == "flytune.adapters.gymnasium:HoverVectorEnv"
 
 
+@pytest.mark.floor
 def test_the_vector_env_is_what_make_vec_makes_and_says_how_it_resets(quiet):
     envs = gymnasium.make_vec("flytune/Hover-v0", num_envs=NUMBER, task="acrobatic")
     assert isinstance(envs, HoverVectorEnv) and envs.task.name == "acrobatic"
@@ -372,6 +374,7 @@ def test_pictures_follow_the_flight():
     np.testing.assert_array_equal(second, env.render())  # looking changes nothing
 
 
+@pytest.mark.floor
 def test_a_vector_env_gives_a_picture_of_each():
     envs = HoverVectorEnv(NUMBER, render_mode="rgb_array", edits={"horizon": 3})
     envs.reset(seed=0)

@@ -24,6 +24,7 @@ def test_a_classical_controller_flies_by_its_name(folder, name):
     assert (judged["who"], judged["task"], judged["crashed"]) == (name, "acrobatic", 0)
 
 
+@pytest.mark.floor
 @pytest.mark.parametrize("simulator", ["pybullet", "mujoco"])
 def test_a_controller_flies_the_same_trials_in_another_simulator(folder, simulator):
     pytest.importorskip(simulator, reason=f"needs flytune[{simulator}]")
@@ -46,6 +47,7 @@ def test_an_option_of_a_simulator_changes_the_flight(folder):
     assert damped["peak_speed"]["median"] < 0.99 * plain["peak_speed"]["median"]
 
 
+@pytest.mark.floor
 def test_an_exported_policy_flies_as_the_run_it_came_from(folder):
     pytest.importorskip("onnxruntime", reason="needs flytune[onnx]")
     answer = flytune("export", "run", "--format", "onnx", "--out", "policy.onnx", cwd=folder)

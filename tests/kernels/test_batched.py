@@ -61,6 +61,17 @@ def test_the_angle_of_two_numbers_is_right_in_every_quadrant(place):
     np.testing.assert_allclose(found, np.arctan2(*points.astype(float)), atol=4e-7)
 
 
+@pytest.mark.floor
+def test_the_numbers_of_a_row_and_the_slope_of_a_tanh_are_those_of_jax():
+    def swapped_and_sloped(row):
+        first, second = jnp.unstack(row)
+        return jnp.stack([second, jax.grad(jnp.tanh)(first)])
+
+    rows = jnp.stack([jnp.linspace(-4.0, 4.0, 9), jnp.linspace(1.0, 2.0, 9)])
+    found = batched(lambda _, row: swapped_and_sloped(row))(rows)
+    np.testing.assert_allclose(found, jax.vmap(swapped_and_sloped, -1, -1)(rows), rtol=1e-4, atol=1e-7)
+
+
 def test_numbers_that_are_not_finite_stay_so():
     x = jnp.asarray([np.nan, np.inf, -np.inf, 0.0], jnp.float32)
     for function in (jnp.exp, jnp.log, jnp.tanh, jnp.abs, lambda v: jnp.maximum(v, 1.0), lambda v: jnp.minimum(v, 1.0)):

@@ -90,6 +90,7 @@ def test_the_page_holds_the_task_with_every_number(read, make_evaluation, task):
     assert all(line in text for line in write_task(task).splitlines())
 
 
+@pytest.mark.floor
 def test_the_page_of_one_controller_has_a_figure_of_each_kind(read, make_evaluation):
     kinds = [{trace["type"] for trace in figure["data"]} for figure in read(make_evaluation()).figures]
     assert kinds == [{"scatter"}, {"scatter"}, {"box"}, {"scatter"}, {"scatter3d"}, {"scatter"}]
@@ -151,6 +152,7 @@ def test_what_cannot_be_drawn_is_said(read, odd_evaluations, odd):
     assert all(figure["data"] for figure in page.figures)
 
 
+@pytest.mark.floor
 def test_several_controllers_are_compared_on_top_and_their_differing_numbers_listed(read, make_evaluation, task):
     faster = dataclasses.replace(task, name="faster", horizon=700)
     page = read(make_evaluation(name="one"), make_evaluation(name="two", task=faster))

@@ -56,6 +56,7 @@ def without_times(rows):
     return [{name: value for name, value in row.items() if name != "seconds"} for row in rows]
 
 
+@pytest.mark.floor
 def test_a_run_directory_holds_what_those_of_other_trainers_hold(task, tmp_path):
     run, other = (train(task, trainer, seed=3, out=tmp_path / trainer) for trainer in ("sb3", "ppo"))
     names = {path.name for path in (tmp_path / "sb3").iterdir()}

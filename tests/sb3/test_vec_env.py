@@ -115,6 +115,7 @@ def test_attributes_can_be_kept_with_single_environments_but_what_they_share_can
     assert environments.env_is_wrapped(Monitor, [0, 3]) == [False, False]
 
 
+@pytest.mark.floor
 @pytest.mark.filterwarnings("error")
 def test_the_wrappers_and_the_logs_of_stable_baselines3_work_on_it(environments):
     wrapped = VecNormalize(VecCheckNan(VecMonitor(environments), raise_exception=True))

@@ -27,6 +27,7 @@ def assert_identical(first, second):
         np.testing.assert_array_equal(one, other)
 
 
+@pytest.mark.floor
 @pytest.mark.parametrize("trainer", OWN)
 def test_a_run_directory_holds_all_that_the_contract_names(small_task, tmp_path, trainer):
     run = train(small_task, trainer, seed=3, out=tmp_path / "run")

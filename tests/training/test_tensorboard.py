@@ -41,6 +41,7 @@ def columns(seen):
     return {tag: [(event.step, event.value) for event in events] for tag, events in seen.items()}
 
 
+@pytest.mark.floor
 def test_tensorboard_reads_every_number_of_every_row_of_a_training_over_its_steps(small_task, tmp_path):
     run = train(small_task, "ppo", out=tmp_path)
     with EventLog(tmp_path) as log:

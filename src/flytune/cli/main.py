@@ -12,7 +12,7 @@ from cyclopts import App, CycloptsError, Parameter
 import flytune
 from flytune.cli import bench, evaluate, export, reproduce, response_map, rules, show, train, tune
 from flytune.cli.refusal import refusal
-from flytune.errors import BadInput, FlytuneError
+from flytune.errors import BadInput, FlytuneError, check_installed
 
 SINGLE_THREADED = "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1"
 COMMANDS = (
@@ -61,6 +61,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     _prepare_jax()
     try:
         command, bound, _ = _parse(sys.argv[1:] if arguments is None else arguments)
+        if command.__module__.startswith("flytune"):  # neither --help nor --version, which are to answer at once
+            check_installed()
         command(*bound.args, **bound.kwargs)
         sys.stdout.flush()
     except FlytuneError as error:

@@ -35,7 +35,9 @@ def pytree(cls: type[T]) -> type[T]:
     structure = [field.name for field in fields if field.metadata.get("static")]
     labels = [field.name for field in fields if field.metadata.get("label")]
     numbers = [field.name for field in fields if field.name not in structure and field.name not in labels]
-    return jax.tree_util.register_dataclass(made, data_fields=numbers, meta_fields=structure, drop_fields=labels)
+    # jax below 0.10 takes each entry of drop_fields for a collection of names: the last entry is for it
+    dropped: Any = [*labels, tuple(labels)]
+    return jax.tree_util.register_dataclass(made, data_fields=numbers, meta_fields=structure, drop_fields=dropped)
 
 
 def with_field(node: Any, path: tuple[str, ...], value: Any) -> Any:

@@ -110,7 +110,9 @@ class Emitter:
         if renamed is not None:
             return renamed
         if name in REDUCTIONS or name in ("argmin", "argmax"):
-            return [self._reduce(name, parameters["axes"], inputs[0], kinds[0].dtype, out.shape)]
+            return [
+                self._reduce(name, [int(axis) for axis in parameters["axes"]], inputs[0], kinds[0].dtype, out.shape)
+            ]
         if name == "dot_general":
             return [self._product(parameters["dimension_numbers"], inputs[0], inputs[1], out.shape)]
         types = [kind.dtype for kind in kinds]
@@ -203,6 +205,10 @@ class Emitter:
                 return add(f"xor {text} {values[0]}, {'true' if text == 'i1' else -1}")
             case "square":
                 return add(f"fmul contract float {values[0]}, {values[0]}")
+            case "one_minus_square":  # of jax from 0.11 on; this form keeps its digits near 1
+                one = constant(1, np.float32)
+                return add(f"fmul contract float {add(f'fadd float {one}, {values[0]}')}, "
+                           f"{add(f'fsub float {one}, {values[0]}')}")  # fmt: skip
             case "integer_pow":
                 return self._integer_power(values[0], parameters["y"])
             case "rsqrt":
@@ -286,7 +292,7 @@ def _rename(name: str, parameters: Any, inputs: list[Values], out: Any) -> list[
         case "stack":
             return [np.stack(inputs, axis=parameters["axis"])]
         case "unstack":
-            return list(np.moveaxis(inputs[0], parameters["axis"], 0))
+            return [np.array(part, object) for part in np.moveaxis(inputs[0], parameters["axis"], 0)]
         case "split":
             return list(np.split(inputs[0], np.cumsum(parameters["sizes"])[:-1], axis=parameters["axis"]))
         case "rev":
