@@ -20,7 +20,7 @@ CLASSICAL = tuple(GAINS)
 
 
 def classical_controller(name: str, task: Task, gains: str = "tuned") -> Controller:
-    """The classical controller of a name for a task's vehicle, target heading and bounds.
+    """The classical controller of a name for a task's vehicle and bounds.
 
     Args:
         name: `pid`, `geometric` or `lqr`.
@@ -67,7 +67,6 @@ def controller_with(gains: AnyGains, task: Task) -> Controller:
     tilts = (float(gains.largest_tilt), limit("tilt"))
     shared: dict[str, Any] = {
         "vehicle": task.vehicle,
-        "target_yaw": float(task.target.yaw),
         "speed_limit": limit("speed"),
         "tilt_limit": min(tilt for tilt in tilts if tilt is not None),
         "body_rate_limit": limit("body_rate"),

@@ -27,10 +27,9 @@ class Controller(Protocol):
 
 @pytree
 class ClassicalController:
-    """A control law for one vehicle and one target heading; it remembers its estimate of the rotor speeds."""
+    """A control law for one vehicle; it remembers its estimate of the rotor speeds."""
 
     vehicle: Vehicle
-    target_yaw: Any  # rad
     speed_limit: Any  # m/s, or None
     tilt_limit: Any  # rad
     body_rate_limit: Any  # rad/s, or None

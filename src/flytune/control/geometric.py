@@ -51,7 +51,7 @@ class Geometric(ClassicalController):
 
         The derivative of W_d is left out: it needs the jerk, which is not measured.
         """
-        sensed = sense(self.target_yaw, observation)
+        sensed = sense(observation)
         rotors = estimated_rotor_speed(self.vehicle, memory, sensed.last_action)
         axes = body_axes(sensed.attitude)
         thrust_now, _ = thrust_and_torque(self.vehicle, rotors)
@@ -100,7 +100,7 @@ class Geometric(ClassicalController):
             sine = jnp.minimum(g.body_rate * self.body_rate_limit / g.attitude, 1.0)
             largest = jnp.minimum(largest, jnp.arcsin(sine))
         yaw = heading(sensed.attitude)
-        return yaw - jnp.clip(wrapped(yaw - self.target_yaw), -largest, largest)
+        return yaw - jnp.clip(yaw, -largest, largest)
 
 
 def wanted_attitude(force: Components, yaw: Any) -> Axes:

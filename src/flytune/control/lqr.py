@@ -59,7 +59,7 @@ class Lqr(ClassicalController):
         The linear law gives small changes of thrust, f_i = f_hover (1 + 2 action_scale u_i). The allocation turns
         their sums into rotor speeds, because it also decides what is reduced where a rotor is at its limit.
         """
-        sensed = sense(self.target_yaw, observation)
+        sensed = sense(observation)
         rotors = estimated_rotor_speed(self.vehicle, memory, sensed.last_action)
         change = unpack(-self.gain @ pack(self.deviation(sensed, rotors)))
         hover = self.vehicle.hover_rotor_speed_rpm
@@ -75,7 +75,7 @@ class Lqr(ClassicalController):
         largest = self.gains.largest_yaw_error
         if self.body_rate_limit is not None:
             largest = jnp.minimum(largest, self.body_rate_limit / self._ratio(directions(self.vehicle)[2], 8, 11))
-        yaw_error = jnp.clip(wrapped(yaw - self.target_yaw), -largest, largest)
+        yaw_error = jnp.clip(yaw, -largest, largest)
         hover = self.vehicle.hover_rotor_speed_rpm
         speeds = ((speed / hover - 1) / self.vehicle.action_scale for speed in rotors)
         velocity = _turned(sensed.velocity, yaw)
@@ -155,7 +155,7 @@ _jacobians = jax.jit(jax.jacrev(_after, argnums=(1, 2)))
 
 
 def _turned(vector: Components, yaw: Any) -> Components:
-    """A vector of the inertial frame in axes turned by the heading."""
+    """A vector of the heading frame in axes turned further, by the vehicle's yaw."""
     x, y, z = vector
     c, s = jnp.cos(yaw), jnp.sin(yaw)
     return c * x + s * y, c * y - s * x, z

@@ -59,7 +59,7 @@ class Pid(ClassicalController):
 
     def act(self, memory: PidMemory, observation: Float[Array, "17"]) -> tuple[PidMemory, Float[Array, "4"]]:
         """The action of one observation, see `Controller`."""
-        sensed = sense(self.target_yaw, observation)
+        sensed = sense(observation)
         rotors = estimated_rotor_speed(self.vehicle, memory.rotor_speed_rpm, sensed.last_action)
         acceleration, integral = self.acceleration(sensed, memory.integral)
         force = specific_force(self.vehicle, acceleration, self.tilt_limit)
@@ -103,7 +103,7 @@ class Pid(ClassicalController):
         angle = jnp.arctan2(sine, z)
         ratio = jnp.where(sine > 0, angle / jnp.where(sine > 0, sine, 1.0), 0.0)
         tilt_rate = shortened((-g.tilt * ratio * y, g.tilt * ratio * x), self.body_rate_limit)
-        yaw_error = wrapped(heading(sensed.attitude) - self.target_yaw)
+        yaw_error = heading(sensed.attitude)
         fastest = g.largest_yaw_rate
         if self.body_rate_limit is not None:  # the rest of it beside tilting
             left_over = jnp.sqrt(jnp.maximum(self.body_rate_limit**2 - safe_norm(tilt_rate) ** 2, 0.0))

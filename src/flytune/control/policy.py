@@ -3,6 +3,7 @@
 import dataclasses
 import itertools
 import json
+import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Literal
@@ -73,6 +74,7 @@ class Policy:
     actor: Network
     input_scale: Float[Array, "17"]  # the observation times this is the input of the actor
     squash: Literal["clip", "tanh"] = static()  # PPO: the mean is clipped; analytic policy gradient: smooth
+    error_limit: Any = math.inf  # m; a position error that is longer is shortened to this, as of a nearer target
     dials: dict[str, Dial] = dataclasses.field(default_factory=dict)  # empty for a policy with one response
     inputs: dict[str, Input] = dataclasses.field(default_factory=dict)  # of the actor, behind the observation
     setting: dict[str, Any] = dataclasses.field(default_factory=dict)  # dial -> its value
@@ -83,6 +85,7 @@ class Policy:
         self, observation: Float[Array, "*batch 17"], setting: Setting | None = None
     ) -> Float[Array, "*batch 4"]:
         """The action in [-1, 1] for one observation or a batch of them, at a setting; its own where None."""
+        observation = limited(observation, self.error_limit)
         scaled = observation * self.input_scale
         if self.inputs:  # these are not scaled
             further = told(self.inputs, observation, self.setting if setting is None else setting)[..., SIZE:]
@@ -134,6 +137,14 @@ class Policy:
         return memory, self(observation)
 
 
+def limited(observation: Float[Array, "*batch 17"], error_limit: Any) -> Float[Array, "*batch 17"]:
+    """The observation with a position error of at most `error_limit` in m; a shorter one stays as it is, bit by bit."""
+    error = observation[..., :3]
+    length = jnp.sqrt(jnp.sum(error * error, axis=-1, keepdims=True))
+    factor = jnp.where(length > error_limit, error_limit / length, 1.0)
+    return jnp.concatenate([factor * error, observation[..., 3:]], axis=-1)
+
+
 def save_policy(path: Path, policy: Policy) -> None:
     """Write a policy as safetensors; its header has the conventions and `about`, as JSON.
 
@@ -144,6 +155,8 @@ def save_policy(path: Path, policy: Policy) -> None:
     for part, layers in (("weight", policy.actor.weights), ("bias", policy.actor.biases)):
         tensors |= {f"actor.{index}.{part}": np.asarray(layer) for index, layer in enumerate(layers)}
     header = {"format": FORMAT, "squash": policy.squash, **CONVENTIONS, "about": policy.about}
+    if math.isfinite(policy.error_limit):
+        header["error_limit"] = float(policy.error_limit)
     if policy.dials:
         for part in ("dials", "inputs"):
             header[part] = {name: document.plain(each) for name, each in getattr(policy, part).items()}
@@ -177,7 +190,7 @@ def load_policy(path: Path) -> Policy:
         raise BadInput(f"{path}: is not a flytune policy (format {header.get('format')!r}). Allowed: {FORMAT}.")
     if not all(isinstance(header.get(part, {}), dict) for part in ("about", "maps")):
         raise BadInput(f"{path}: has a damaged header. Train it again.")
-    if header.get("observation") != observation.LAYOUT:
+    if header.get("observation") not in (observation.LAYOUT, *observation.EARLIER_LAYOUTS):
         raise BadInput(
             f"{path}: was trained on another observation, {header.get('observation')!r}. "
             f"Allowed: {observation.LAYOUT}. Train it again with this version."
@@ -192,6 +205,9 @@ def _assemble(path: Path, header: dict[str, Any], tensors: dict[str, np.ndarray]
         raise BadInput(f"{path}: is a damaged policy (tensors {sorted(tensors)}). Train it again.")
     weights, biases = ([tensors[f"actor.{i}.{part}"] for i in range(layers)] for part in ("weight", "bias"))
     dials, inputs, setting = _dials(path, header)
+    error_limit = header.get("error_limit", math.inf)
+    if type(error_limit) not in (int, float) or not error_limit > 0:
+        raise BadInput(f"{path}: has an error limit of {error_limit!r}, allowed: above 0 m. Train it again.")
     width = SIZE + number_of_inputs(inputs)
     for index, (weight, bias) in enumerate(zip(weights, biases, strict=True)):
         wanted = (width, weight.shape[1]) if weight.ndim == 2 else "a matrix"
@@ -207,6 +223,7 @@ def _assemble(path: Path, header: dict[str, Any], tensors: dict[str, np.ndarray]
         actor=Network(weights=tuple(map(jnp.asarray, weights)), biases=tuple(map(jnp.asarray, biases))),
         input_scale=jnp.asarray(tensors["input_scale"]),
         squash=header["squash"],
+        error_limit=float(error_limit),
         dials=dials,
         inputs=inputs,
         setting=setting,

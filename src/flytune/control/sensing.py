@@ -1,4 +1,4 @@
-"""The observation as a classical controller uses it: the 17 numbers, with the attitude in the inertial frame."""
+"""The observation as a classical controller uses it: the 17 numbers by their parts, in the target's heading frame."""
 
 from typing import Any
 
@@ -14,20 +14,19 @@ from flytune.physics.components import Components, unpack
 class Sensed:
     """A noisy observation by its parts; vectors as tuples of scalars."""
 
-    position_error: Components  # 3, m, p - p*, inertial frame
-    attitude: Components  # 4, unit quaternion (x, y, z, w), body to inertial
-    velocity: Components  # 3, m/s, inertial frame
+    position_error: Components  # 3, m, p - p*, heading frame
+    attitude: Components  # 4, unit quaternion (x, y, z, w), body to heading frame; the target's yaw is 0 there
+    velocity: Components  # 3, m/s, heading frame
     body_rate: Components  # 3, rad/s, body frame
     last_action: Components  # 4, in [-1, 1]
 
 
-def sense(target_yaw: Any, observation: Float[Array, "17"]) -> Sensed:
-    """The parts of an observation; the attitude is q = q* (x) q_e, with q* the target's heading in rad."""
+def sense(observation: Float[Array, "17"]) -> Sensed:
+    """The parts of an observation."""
     numbers = unpack(observation)
-    zero = jnp.zeros(())
     return Sensed(
         position_error=numbers[:3],
-        attitude=rotation.multiply(rotation.from_euler(zero, zero, jnp.asarray(target_yaw)), numbers[3:7]),
+        attitude=numbers[3:7],
         velocity=numbers[7:10],
         body_rate=numbers[10:13],
         last_action=numbers[13:],
@@ -46,7 +45,7 @@ def wrapped(angle: Any) -> Any:
 
 
 def body_axes(attitude: Components) -> tuple[Components, Components, Components]:
-    """The body's x, y and z axes seen in the inertial frame: the columns of R(q)."""
+    """The body's x, y and z axes seen in the frame of the attitude: the columns of R(q)."""
     x, y, z, w = attitude
     forward = (1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y))
     left = (2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x))

@@ -8,6 +8,7 @@ and vehicle the policy was trained.
 
 import itertools
 import json
+import math
 from collections.abc import Callable
 from importlib import metadata
 from pathlib import Path
@@ -121,7 +122,8 @@ def _model(policy: Policy) -> Any:
         nodes.append(helper.make_node(operator, inputs, [output], name=output, **attributes))
         return output
 
-    value = node("Mul", INPUT, weight("input_scale", policy.input_scale), output="scaled")
+    seen = _limited(policy, node, weight) if math.isfinite(policy.error_limit) else INPUT
+    value = node("Mul", seen, weight("input_scale", policy.input_scale), output="scaled")
     if policy.inputs:
         value = node("Concat", value, *_further_inputs(policy, node, weight), output="inputs", axis=1)
     last = len(policy.actor.weights) - 1

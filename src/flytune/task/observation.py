@@ -14,15 +14,20 @@ from flytune.config.pytree import pytree
 from flytune.physics import rotation
 from flytune.physics.components import add, pack, scale, unpack
 from flytune.physics.dynamics import State
-from flytune.task.situation import Target, attitude_error, position_error
+from flytune.task.situation import Target, attitude_error, in_heading_frame, position_error
 
 SIZE = 17
 BLOCK_NAMES = ("position_error", "attitude_error", "velocity", "body_rate", "last_action")
 BLOCKS = (3, 4, 3, 3, 4)  # numbers in each
 NOISY = 13  # the first 13 carry noise; the last action does not
 LAYOUT = (
-    "position_error (3) [m], attitude_error (4) [x y z w], velocity (3) [m/s, inertial], "
+    "position_error (3) [m, heading frame], attitude_error (4) [x y z w], velocity (3) [m/s, heading frame], "
     "body_rate (3) [rad/s, body], last_action (4)"
+)
+# written by version 0.1, whose targets had yaw 0: there the inertial frame is the heading frame
+EARLIER_LAYOUTS = (
+    "position_error (3) [m], attitude_error (4) [x y z w], velocity (3) [m/s, inertial], "
+    "body_rate (3) [rad/s, body], last_action (4)",
 )
 
 
@@ -45,6 +50,9 @@ def observe(
 ) -> Float[Array, "17"]:
     """What the controller sees of a true state: [e_p, q_e, v, w, a_{t-1}].
 
+    Position error and velocity are seen in the heading frame, whose x axis points where the target looks. So a
+    controller does the same for every yaw of the target.
+
     Args:
         target: where to hover.
         noise: standard deviations.
@@ -55,9 +63,9 @@ def observe(
     Source: paper R7, R8. Reading: the quaternion is flipped, then noise is added, then it is normalised.
     """
     numbers = unpack(normal)
-    position = add(position_error(target, state.position), scale(noise.position, numbers[:3]))
+    position = add(in_heading_frame(target, position_error(target, state.position)), scale(noise.position, numbers[:3]))
     attitude = rotation.normalise(add(attitude_error(target, state.attitude), scale(noise.attitude, numbers[3:7])))
-    velocity = add(state.velocity, scale(noise.velocity, numbers[7:10]))
+    velocity = add(in_heading_frame(target, state.velocity), scale(noise.velocity, numbers[7:10]))
     body_rate = add(state.body_rate, scale(noise.body_rate, numbers[10:]))
     return pack((*position, *attitude, *velocity, *body_rate, *unpack(last_action)))
 

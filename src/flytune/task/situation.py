@@ -54,6 +54,18 @@ def attitude_error(target: Target, attitude: Components) -> Components:
     return rotation.shortest(rotation.multiply(rotation.conjugate(wanted), attitude))
 
 
+def in_heading_frame(target: Target, vector: Components) -> Components:
+    """A vector of the inertial frame, in axes turned about z by the target's yaw: its x axis points where the target looks.
+
+    At yaw 0 the numbers stay as they are, bit by bit.
+    """
+    half = jnp.asarray(target.yaw) / 2
+    sine, cosine = jnp.sin(half), jnp.cos(half)
+    c, s = 1 - 2 * sine * sine, 2 * sine * cosine
+    x, y, z = vector
+    return c * x + s * y, c * y - s * x, z
+
+
 def situation(target: Target, state: State, action_change: Float[Array, "4"]) -> Situation:
     """The situation of a true state, after an action that differed from the one before by `action_change`."""
     roll, pitch = rotation.roll_pitch(state.attitude)
