@@ -57,7 +57,7 @@ def same(first, second, rtol=0.0, atol=0.0):
 def test_a_reset_starts_at_a_drawn_state_with_the_hover_action(compiled, baseline):
     key = jax.random.key(3)
     start = compiled["reset"](baseline, key)
-    same(start.state, baseline.initial_state.draw(baseline.vehicle, key), atol=1e-6, rtol=1e-6)
+    same(start.state, baseline.initial_state.draw(baseline.vehicle, baseline.target, key), atol=1e-6, rtol=1e-6)
     assert start.last_action.tolist() == [0, 0, 0, 0]
     assert (int(start.steps), float(start.reward)) == (0, 0.0)
 

@@ -10,6 +10,7 @@ from flytune.errors import BadInput, require
 from flytune.physics.dynamics import CONTROL_PERIOD
 from flytune.simulation.host import HostEnvironment
 from flytune.simulation.simulator import VehicleStates
+from flytune.task.agreement import check_starts
 from flytune.task.files import load_task
 from flytune.task.observation import SIZE
 from flytune.task.task import Task
@@ -28,15 +29,15 @@ def read_task(task: str | Path | Task, edits: dict[str, Any] | None) -> Task:
     """The task by preset name or file, edited, or the Task itself.
 
     Raises:
-        BadInput: no such task, or edits of a Task.
+        BadInput: no such task, edits of a Task, or a task whose episodes end as they begin.
     """
-    if not isinstance(task, Task):
-        return load_task(task, edits)
-    if edits:
+    if isinstance(task, Task) and edits:
         raise BadInput(
             "edits: a Task cannot be edited here. Allowed: edits of a preset or a file. Edit the Task itself."
         )
-    return task
+    read = task if isinstance(task, Task) else load_task(task, edits)
+    check_starts(read)
+    return read
 
 
 def make_spaces() -> tuple[gymnasium.spaces.Box, gymnasium.spaces.Box]:

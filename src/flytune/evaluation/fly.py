@@ -72,6 +72,8 @@ def fly(
     _check_controller(controller)
     steps = round(duration / CONTROL_PERIOD)
     initial_state = EVALUATION_INITIAL_STATES[initial_conditions]
+    if problem := initial_state.problem_around(task.target):
+        raise BadInput(f"starts {initial_conditions}: {problem}")
     starts, noise_keys = _begin(task, initial_state, trial_keys(seed, trials))
     simulator_name, made = _made(simulator, task.vehicle, trials, simulator_options)
     try:
@@ -226,7 +228,7 @@ def _begin(task: Task, initial_state: InitialState, keys: jax.Array) -> tuple[ja
 
     def one(key: jax.Array) -> tuple[jax.Array, jax.Array]:
         start_key, noise_key = jax.random.split(key)
-        return state_numbers(initial_state.draw(task.vehicle, start_key)), noise_key
+        return state_numbers(initial_state.draw(task.vehicle, task.target, start_key)), noise_key
 
     return jax.vmap(one, out_axes=(-1, 0))(keys)
 

@@ -66,7 +66,7 @@ def reset(family: TaskFamily, key: jax.Array) -> Episode:
     """A new episode: the family draws its numbers, and the task its initial state."""
     numbers, key = family.draw(key)
     task = family.member(numbers)
-    return begin(task.initial_state.draw(task.vehicle, key), numbers)
+    return begin(task.initial_state.draw(task.vehicle, task.target, key), numbers)
 
 
 def observe(task: Task, episode: Episode, normal: Float[Array, "13"]) -> Float[Array, "17"]:

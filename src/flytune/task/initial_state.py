@@ -4,25 +4,34 @@ import math
 from typing import Annotated
 
 import jax
+import jax.numpy as jnp
 from annotated_types import Ge, Le, Unit
 
 from flytune.config.document import Real
 from flytune.config.pytree import pytree
 from flytune.physics import rotation
+from flytune.physics.components import Components
 from flytune.physics.dynamics import State, hovering
 from flytune.physics.vehicle import Vehicle
+from flytune.task.situation import Target
 
-Metres = Annotated[Real, Unit("m")]
+Metres = Annotated[Real, Ge(-1000), Le(1000), Unit("m")]
 
 
 @pytree
 class InitialState:
-    """Uniform in a box and in attitude, at rest, rotors at hover speed."""
+    """Uniform in a box around the target and in attitude, at rest, rotors at hover speed.
 
-    lowest_position: tuple[Metres, Metres, Metres]
-    highest_position: tuple[Metres, Metres, Metres]
-    largest_tilt: Annotated[Real, Ge(0), Le(math.pi / 2), Unit("rad")]  # of roll and of pitch
-    largest_yaw: Annotated[Real, Ge(0), Le(math.pi), Unit("rad")]
+    The box is relative to the target: it is written for a target at `for_target` and moves with the task's own, but no
+    start lies below `lowest_altitude`. The heading is relative to that of the target; the box does not turn with it.
+    """
+
+    lowest_position: tuple[Metres, Metres, Metres]  # corner of the box for a target at for_target
+    highest_position: tuple[Metres, Metres, Metres]  # the opposite corner
+    for_target: tuple[Metres, Metres, Metres] = (0.0, 0.0, 1.0)  # paper R19; with [0, 0, 0], corners are offsets
+    lowest_altitude: Metres = 0.0  # of a start; the box is cut off below
+    largest_tilt: Annotated[Real, Ge(0), Le(math.pi), Unit("rad")]  # of roll and of pitch
+    largest_yaw: Annotated[Real, Ge(0), Le(math.pi), Unit("rad")]  # from the heading of the target
 
     def problem(self) -> str | None:
         """What makes the numbers impossible together, or None."""
@@ -31,13 +40,30 @@ class InitialState:
                 return f"lowest_position: {low} in {axis} lies above highest_position, {high}. Allowed: {high} or less."
         return None
 
-    def draw(self, vehicle: Vehicle, key: jax.Array) -> State:
-        """One state of the distribution."""
+    def problem_around(self, target: Target) -> str | None:
+        """What leaves no start around a target, or None."""
+        highest = float(self.highest_position[2] + self.moved(target)[2])
+        if highest >= self.lowest_altitude:
+            return None
+        return (
+            f"lowest_altitude: {float(self.lowest_altitude):g} m lies above all starts, whose box ends at {highest:g} "
+            f"m for a target at {float(target.position[2]):g} m. Give a lower one, or a higher target.position."
+        )
+
+    def moved(self, target: Target) -> Components:
+        """How far the box of a target lies from the box as it is written, in m."""
+        return tuple(here - there for here, there in zip(target.position, self.for_target, strict=True))
+
+    def draw(self, vehicle: Vehicle, target: Target, key: jax.Array) -> State:
+        """One state of the distribution around a target."""
         unit = jax.random.uniform(key, (6,))
-        box = zip(self.lowest_position, self.highest_position, unit[:3], strict=True)
-        position = tuple(low + (high - low) * share for low, high, share in box)
+        box = zip(self.lowest_position, self.highest_position, unit[:3], self.moved(target), strict=True)
+        x, y, z = (low + (high - low) * share + moved for low, high, share, moved in box)
+        bottom, top = (each[2] + self.moved(target)[2] for each in (self.lowest_position, self.highest_position))
+        above = self.lowest_altitude + (top - self.lowest_altitude) * unit[2]
+        position = x, y, jnp.where(bottom < self.lowest_altitude, above, z)
         roll, pitch = (self.largest_tilt * (2 * share - 1) for share in unit[3:5])
-        yaw = self.largest_yaw * (2 * unit[5] - 1)
+        yaw = target.yaw + self.largest_yaw * (2 * unit[5] - 1)
         return hovering(vehicle, position, rotation.from_euler(roll, pitch, yaw))
 
 
@@ -49,9 +75,10 @@ EVALUATION_INITIAL_STATES = {
         largest_tilt=math.radians(15),
         largest_yaw=math.pi,
     ),
-    # the same without the starts that are already terminated
+    # the same without the starts that are already terminated: at least 0.1 m high, wherever the target is
     "clear": InitialState(
-        lowest_position=(-2.0, -2.0, 0.1),
+        lowest_position=(-2.0, -2.0, 0.0),
+        lowest_altitude=0.1,
         highest_position=(2.0, 2.0, 2.0),
         largest_tilt=math.radians(15),
         largest_yaw=math.pi,

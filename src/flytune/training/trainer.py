@@ -60,9 +60,12 @@ class Trainer:
         """Refuse a task that this trainer cannot train here, before anything is written.
 
         Raises:
-            BadInput: a package is not installed, or the trainer lacks a setting that the task uses.
+            BadInput: a package is not installed, the trainer lacks a setting that the task uses, or every episode would
+                end as it begins.
         """
         import numpy as np
+
+        from flytune.task.agreement import check_starts
 
         for package in self.packages:
             require(package, self.extra)
@@ -80,6 +83,9 @@ class Trainer:
                     f"{self.settings_field}.{name}: {json.dumps(value)} is not allowed with trainer {self.name}, which "
                     f"has no such setting. Allowed: {json.dumps(default)}. Give this value, or another trainer."
                 )
+        own = getattr(settings, "initial_state", None)  # of a trainer that does not begin where the task does
+        where = "initial_state" if own is None else f"{self.settings_field}.initial_state"
+        check_starts(task, own, where, float(getattr(settings, "termination_slack", 0.0)))
 
     def start(self, task: Task, key: Array) -> Any:
         """The training state before the first update."""
