@@ -12,7 +12,7 @@ from flytune.config.document import Real
 from flytune.config.pytree import pytree
 from flytune.control.actuation import action_for, allocate, estimated_rotor_speed
 from flytune.control.controller import ClassicalController, shortened, slowed
-from flytune.control.sensing import Sensed, heading, sense, wrapped
+from flytune.control.sensing import Sensed, heading, sense
 from flytune.errors import BadInput
 from flytune.physics import dynamics, rotation
 from flytune.physics.components import Components, pack, unpack

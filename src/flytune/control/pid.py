@@ -10,7 +10,7 @@ from flytune.config.document import Real
 from flytune.config.pytree import pytree
 from flytune.control.actuation import action_for, allocate, estimated_rotor_speed, torque_for
 from flytune.control.controller import ClassicalController, shortened, slowed, specific_force
-from flytune.control.sensing import Sensed, body_axes, dot, heading, sense, wrapped
+from flytune.control.sensing import Sensed, body_axes, dot, heading, sense
 from flytune.physics.components import Components, add, scale
 from flytune.physics.dynamics import CONTROL_PERIOD
 from flytune.physics.rotation import safe_norm

@@ -37,7 +37,7 @@ def fly(
     *,
     trials: int = 100,
     seed: int = 1,
-    initial_conditions: InitialConditions = "clear",
+    initial_conditions: InitialConditions | InitialState = "clear",
     duration: float | None = None,
     name: str = "",
     simulator: str | Callable[[Vehicle, int], Simulator] = "flytune",
@@ -53,7 +53,7 @@ def fly(
         task: the task, with its vehicle.
         trials: number of trials, 1 or more.
         seed: of initial states and noise.
-        initial_conditions: `clear` (z0 >= 0.1 m) or `paper` (exactly as printed).
+        initial_conditions: `clear` (z0 >= 0.1 m), `paper` (exactly as printed), or a distribution of your own.
         duration: of a trial in s, more than 0.5; the task's own where None.
         name: the controller's name in the flights.
         simulator: one of `flytune`, `pybullet`, `mujoco`; or a function that makes another one, from a vehicle and the
@@ -68,13 +68,16 @@ def fly(
         controller, name = controller.controller, name or controller.name
     family, task = task, task.at({name: values[0] for name, values in settings_along(controller, task, 1).items()})
     duration = task.duration if duration is None else duration
-    _check_arguments(trials, seed, initial_conditions, duration)
+    own = isinstance(initial_conditions, InitialState)
+    starts_name = "own" if own else initial_conditions
+    _check_arguments(trials, seed, "clear" if own else starts_name, duration)
     _check_controller(controller)
     steps = round(duration / CONTROL_PERIOD)
-    initial_state = EVALUATION_INITIAL_STATES[initial_conditions]
-    if problem := initial_state.problem_around(task.target):
-        raise BadInput(f"starts {initial_conditions}: {problem}")
-    starts, noise_keys = _begin(task, initial_state, trial_keys(seed, trials))
+    initial_state = initial_conditions if own else EVALUATION_INITIAL_STATES[initial_conditions]
+    if problem := initial_state.problem() or initial_state.problem_around(task.target):
+        raise BadInput(f"starts {starts_name}: {problem}")
+    task = dataclasses.replace(task, initial_state=initial_state)
+    starts, noise_keys = _begin(task, trial_keys(seed, trials))
     simulator_name, made = _made(simulator, task.vehicle, trials, simulator_options)
     try:
         record = rollout_trials(made, controller, task, starts, noise_keys, steps, name)
@@ -97,7 +100,7 @@ def fly(
         vehicle=task.vehicle.name,
         simulator=simulator_name,
         seed=seed,
-        initial_conditions=initial_conditions,
+        initial_conditions=starts_name,
         dial=shown_setting(controller),
     )
 
@@ -223,12 +226,12 @@ def _trial_keys(seed: jax.Array, trials: int) -> jax.Array:
 
 
 @program()
-def _begin(task: Task, initial_state: InitialState, keys: jax.Array) -> tuple[jax.Array, jax.Array]:
+def _begin(task: Task, keys: jax.Array) -> tuple[jax.Array, jax.Array]:
     """The states [17, N] in which trials begin, and the keys of their noise."""
 
     def one(key: jax.Array) -> tuple[jax.Array, jax.Array]:
         start_key, noise_key = jax.random.split(key)
-        return state_numbers(initial_state.draw(task.vehicle, task.target, start_key)), noise_key
+        return state_numbers(task.initial_state.draw(task.vehicle, task.target, start_key)), noise_key
 
     return jax.vmap(one, out_axes=(-1, 0))(keys)
 

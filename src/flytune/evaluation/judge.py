@@ -221,7 +221,8 @@ def _crashed(flights: Flights) -> PerTrialFlag:
     lost = [~np.isfinite(state).all(axis=(1, 2)) for state in states]
     with np.errstate(over="ignore", invalid="ignore"):
         distance = np.linalg.norm(flights.position - flights.target_position, axis=-1)
-    return np.logical_or.reduce([flights.crashed, (distance > CRASH_DISTANCE).any(axis=1), *lost])
+    radius = np.maximum(CRASH_DISTANCE, 2 * distance[:, :1])  # a start far away doubles its own distance
+    return np.logical_or.reduce([flights.crashed, (distance > radius).any(axis=1), *lost])
 
 
 def _settling(settling_time: PerTrial) -> dict:

@@ -21,7 +21,7 @@ from jaxtyping import Float
 
 from flytune.config import document
 from flytune.config.files import write_bytes
-from flytune.control.policy import CONVENTIONS, Policy
+from flytune.control.policy import CONVENTIONS, Policy, limited
 from flytune.errors import BadInput, require
 from flytune.export.untrusted.onnx_controller import OnnxController, load_onnx, read_onnx, sample_observations
 from flytune.export.untrusted.onnx_inspection import DIAL_INPUT, DIALS, FORMAT, INPUT, OUTPUT, VERSION
@@ -35,6 +35,7 @@ OPERATOR_SET, INTERMEDIATE_REPRESENTATION = 13, 7
 CHECKED = 10_000  # observations for which the file must give the actions of the policy
 UNIT_ROUNDOFF = 2.0**-24  # of float32
 FORMULA_ERROR = 32 * UNIT_ROUNDOFF  # of an input that a formula gives: each of its few operations rounds
+LIMIT_ERROR = 8 * UNIT_ROUNDOFF  # of a position error that is shortened: three squares, a root, a quotient, a product
 TANH_ERROR = 8 * UNIT_ROUNDOFF  # measured: 5.5 in onnxruntime 1.32, 4.6 in XLA, over all of [-12, 12]
 
 
@@ -60,10 +61,11 @@ def rounding_bound(policy: Policy, observations: Float[np.ndarray, "batch 17"]) 
 
     Source: Higham 2002, Accuracy and Stability of Numerical Algorithms, section 3.1; the mean value theorem.
     """
-    x = observations.astype(float) * np.asarray(policy.input_scale, float)
-    error = UNIT_ROUNDOFF * np.abs(x)
+    seen = np.asarray(limited(jnp.asarray(observations), policy.error_limit))
+    x = seen.astype(float) * np.asarray(policy.input_scale, float)
+    error = np.where(seen == observations, UNIT_ROUNDOFF, LIMIT_ERROR) * np.abs(x)
     if policy.inputs:
-        further = np.asarray(told(policy.inputs, jnp.asarray(observations), policy.setting), float)[:, SIZE:]
+        further = np.asarray(told(policy.inputs, jnp.asarray(seen), policy.setting), float)[:, SIZE:]
         x = np.concatenate([x, further], axis=-1)
         error = np.concatenate([error, FORMULA_ERROR * np.abs(further)], axis=-1)
     last = len(policy.actor.weights) - 1
@@ -125,7 +127,7 @@ def _model(policy: Policy) -> Any:
     seen = _limited(policy, node, weight) if math.isfinite(policy.error_limit) else INPUT
     value = node("Mul", seen, weight("input_scale", policy.input_scale), output="scaled")
     if policy.inputs:
-        value = node("Concat", value, *_further_inputs(policy, node, weight), output="inputs", axis=1)
+        value = node("Concat", value, *_further_inputs(policy, seen, node, weight), output="inputs", axis=1)
     last = len(policy.actor.weights) - 1
     for index, (matrix, bias) in enumerate(zip(policy.actor.weights, policy.actor.biases, strict=True)):
         layer = f"actor.{index}"
@@ -161,7 +163,22 @@ def _model(policy: Policy) -> Any:
     return model
 
 
-def _further_inputs(policy: Policy, node: Callable[..., str], weight: Callable[..., str]) -> list[str]:
+def _limited(policy: Policy, node: Callable[..., str], weight: Callable[..., str]) -> str:
+    """The observation with a position error of at most the policy's limit, as a node of the graph."""
+    error, rest = (
+        node("Gather", INPUT, weight(f"{name}.columns", columns, np.int64), output=name, axis=1)
+        for name, columns in (("position_error", range(3)), ("rest", range(3, SIZE)))
+    )
+    square = node("Mul", error, error, output="position_error.square")
+    length = node("Sqrt", node("ReduceSum", square, weight("axis", [1], np.int64), output="sum"), output="length")
+    most = weight("error_limit", policy.error_limit)
+    factor = node("Div", most, node("Max", length, most, output="length.or.limit"), output="factor")
+    return node("Concat", node("Mul", error, factor, output="near"), rest, output="limited", axis=1)
+
+
+def _further_inputs(
+    policy: Policy, observation: str, node: Callable[..., str], weight: Callable[..., str]
+) -> list[str]:
     """The inputs of the network behind the observation, each [batch, its size], as nodes of the graph."""
     count = itertools.count()
     operators = {"+": "Add", "-": "Sub", "*": "Mul", "/": "Div", "**": "Pow"}
@@ -185,7 +202,7 @@ def _further_inputs(policy: Policy, node: Callable[..., str], weight: Callable[.
         each, block = policy.inputs[name], one
         if (rows := each.rows()) is not None:
             numbers = weight(f"input.{name}.rows", range(SIZE)[rows], np.int64)
-            block = node("Gather", INPUT, numbers, output=f"input.{name}.block", axis=1)
+            block = node("Gather", observation, numbers, output=f"input.{name}.block", axis=1)
         value = each.value.build(columns.__getitem__, operation, constant)
         parts.append(node("Mul", value, block, output=f"input.{name}"))
     return parts

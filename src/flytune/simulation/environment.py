@@ -143,10 +143,14 @@ def hold(
 
 
 def is_crashed(task: Task, state: State) -> Bool[Array, ""]:
-    """Whether a vehicle has crashed: it left the ball around its target, or its state is not finite."""
+    """Whether a vehicle has crashed: it left the ball around its target, or its state is not finite.
+
+    The ball has a radius of 10 m, and of twice the farthest start where that is more.
+    """
     distance = safe_norm(position_error(task.target, state.position))
+    radius = jnp.maximum(CRASH_DISTANCE, 2 * task.initial_state.farthest())
     body = jnp.stack([*state.position, *state.attitude, *state.velocity, *state.body_rate])
-    return ~((distance <= CRASH_DISTANCE) & jnp.all(jnp.isfinite(body)))
+    return ~((distance <= radius) & jnp.all(jnp.isfinite(body)))
 
 
 def margins_along(

@@ -1,7 +1,7 @@
 """Distributions of initial states: where a training episode or a trial begins (paper R15, R19)."""
 
 import math
-from typing import Annotated
+from typing import Annotated, Any
 
 import jax
 import jax.numpy as jnp
@@ -12,6 +12,7 @@ from flytune.config.pytree import pytree
 from flytune.physics import rotation
 from flytune.physics.components import Components
 from flytune.physics.dynamics import State, hovering
+from flytune.physics.rotation import safe_norm
 from flytune.physics.vehicle import Vehicle
 from flytune.task.situation import Target
 
@@ -53,6 +54,12 @@ class InitialState:
     def moved(self, target: Target) -> Components:
         """How far the box of a target lies from the box as it is written, in m."""
         return tuple(here - there for here, there in zip(target.position, self.for_target, strict=True))
+
+    def farthest(self) -> Any:
+        """The largest distance of a start from the target in m."""
+        ends = zip(self.lowest_position, self.highest_position, self.for_target, strict=True)
+        sides = (jnp.maximum(jnp.abs(low - middle), jnp.abs(high - middle)) for low, high, middle in ends)
+        return safe_norm(tuple(sides))
 
     def draw(self, vehicle: Vehicle, target: Target, key: jax.Array) -> State:
         """One state of the distribution around a target."""

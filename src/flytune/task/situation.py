@@ -55,7 +55,7 @@ def attitude_error(target: Target, attitude: Components) -> Components:
 
 
 def in_heading_frame(target: Target, vector: Components) -> Components:
-    """A vector of the inertial frame, in axes turned about z by the target's yaw: its x axis points where the target looks.
+    """A vector of the inertial frame in the heading frame: its x axis points where the target looks, z is up.
 
     At yaw 0 the numbers stay as they are, bit by bit.
     """

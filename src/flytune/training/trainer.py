@@ -103,11 +103,11 @@ class Trainer:
 
     def policy(self, task: Task, train_state: Any) -> Policy:
         """The policy of the training: for PPO, of the moving average of the weights."""
-        return _with_dials(self._algorithm().policy(self.settings(task), train_state), task)
+        return _completed(self._algorithm().policy(self.settings(task), train_state), task)
 
     def last_policy(self, task: Task, train_state: Any) -> Policy:
         """The policy of the last update."""
-        return _with_dials(self._algorithm().last_policy(self.settings(task), train_state), task)
+        return _completed(self._algorithm().last_policy(self.settings(task), train_state), task)
 
     def warm_start(self, task: Task, train_state: Any, policy: Policy) -> Any:
         """The training state before the first update, with an actor that gives the actions of `policy`.
@@ -141,10 +141,23 @@ class Trainer:
         return import_module(self.module)
 
 
-def _with_dials(policy: Policy, task: Task) -> Policy:
-    """The policy with the dials of its task, at their defaults."""
+def _completed(policy: Policy, task: Task) -> Policy:
+    """The policy with the dials of its task at their defaults, and with the longest position error it has to know.
+
+    That is the distance of the farthest start, of the training or of an evaluation.
+    """
+    from flytune.task.initial_state import EVALUATION_INITIAL_STATES
+    from flytune.task.situation import POSITION_BAND
+
     setting = {name: float(dial.default) for name, dial in task.dial.items()}
-    return dataclasses.replace(policy, dials=task.dial, inputs=task.input, setting=setting)
+    starts = (task.initial_state, *EVALUATION_INITIAL_STATES.values())
+    return dataclasses.replace(
+        policy,
+        dials=task.dial,
+        inputs=task.input,
+        setting=setting,
+        error_limit=round(max(float(each.farthest()) for each in starts) + POSITION_BAND, 3),
+    )
 
 
 TRAINERS = {
