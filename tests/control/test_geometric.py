@@ -69,7 +69,7 @@ def test_the_wanted_turn_is_the_rate_of_the_wanted_attitude():
 def test_a_small_position_error_gives_the_force_of_the_paper(baseline, observation):
     # textbook: k_x = 16, k_v = 5.6: e = (0.01, 0, -0.02), v = (0, 0.1, 0)
     controller = classical_controller("geometric", baseline, "textbook")
-    sensed = sense(0.0, observation(baseline, position=(0.01, 0, 0.98), velocity=(0, 0.1, 0)))
+    sensed = sense(observation(baseline, position=(0.01, 0, 0.98), velocity=(0, 0.1, 0)))
     np.testing.assert_allclose(
         np.stack(controller.force(sensed.position_error, sensed.velocity)), [-0.16, -0.56, 9.81 + 0.32], atol=1e-5
     )
@@ -79,5 +79,5 @@ def test_a_far_heading_is_approached_by_way_of_nearer_ones(baseline, observation
     controller = classical_controller("geometric", baseline, "textbook")
     largest = controller.gains.largest_yaw_error
     for yaw in (0.5, -3.0, 3.1):
-        reference = controller.reference_yaw(sense(0.0, observation(baseline, angles=(0, 0, yaw))))
+        reference = controller.reference_yaw(sense(observation(baseline, angles=(0, 0, yaw))))
         np.testing.assert_allclose(reference, yaw - math.copysign(min(abs(yaw), largest), yaw), atol=1e-5)

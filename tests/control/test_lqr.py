@@ -92,7 +92,7 @@ def test_the_deviation_is_seen_along_the_heading(observation):
     controller = classical_controller("lqr", task, "textbook")
     yaw = math.pi / 2
     seen = observation(task, position=(0, 0.01, 1), velocity=(0.02, 0, 0), angles=(0.01, 0.02, yaw))
-    x = np.stack(controller.deviation(sense(1.5, seen), hovering_rotors(task.vehicle)))
+    x = np.stack(controller.deviation(sense(seen), hovering_rotors(task.vehicle)))
     wanted = [0.01, 0, 0, 0, -0.02, 0, 0.01, 0.02, yaw - 1.5, 0, 0, 0, 0, 0, 0, 0]
     np.testing.assert_allclose(x, wanted, atol=1.5e-4)  # small angles: a quaternion's part is half of it, to 2e-4 / 24
 

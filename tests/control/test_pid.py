@@ -42,7 +42,7 @@ def pid(baseline, gains):
 
 
 def seen(observation, task, **state):
-    return sense(0.0, observation(task, **state))
+    return sense(observation(task, **state))
 
 
 ZERO = tuple(jnp.zeros(3))

@@ -1,5 +1,6 @@
 """Policies: what they answer, how they start, and the file they are kept in (paper R7, R9, R16)."""
 
+import dataclasses
 import itertools
 import json
 import math
@@ -14,7 +15,7 @@ import safetensors.numpy
 from flytune.control.controller import Controller
 from flytune.control.policy import FORMAT, HEADER, Network, Policy, load_policy, make_network, save_policy
 from flytune.errors import BadInput
-from flytune.task.observation import LAYOUT
+from flytune.task.observation import EARLIER_LAYOUTS, LAYOUT
 
 SIZES = (17, 64, 64, 4)
 ABOUT = {"task": "baseline", "vehicle": "crazyflie", "trainer": "apg", "seed": 3}
@@ -99,6 +100,33 @@ def test_another_seed_gives_another_network(networks):
     assert not np.allclose(other.weights[0], networks.weights[0])
 
 
+def test_a_position_error_beyond_the_limit_is_seen_as_one_at_the_limit(policy, observations):
+    limit = 2.0
+    near = dataclasses.replace(policy, error_limit=limit)
+    length = np.linalg.norm(observations[:, :3], axis=1)
+    assert (length < limit).any() and (length > limit).any()
+    shortened = np.array(observations)
+    far = length > limit
+    shortened[far, :3] *= (limit / length[far])[:, None]
+    np.testing.assert_allclose(near(observations), policy(jnp.asarray(shortened)), atol=1e-6)
+    np.testing.assert_array_equal(near(observations)[~far], policy(observations)[~far])
+    np.testing.assert_array_equal(near(jnp.zeros(17)), policy(jnp.zeros(17)))
+
+
+def test_the_limit_of_the_position_error_is_kept_in_the_file(policy, tmp_path):
+    path = tmp_path / "near.safetensors"
+    save_policy(path, dataclasses.replace(policy, error_limit=2.5))
+    assert load_policy(path).error_limit == 2.5
+    save_policy(path, policy)
+    assert load_policy(path).error_limit == math.inf
+    for damaged in (0, -1, "far", True, [2], math.nan):
+        assert "error limit" in refusal(forge(path, {"error_limit": damaged}))
+
+
+def test_a_file_of_the_earlier_layout_is_read(saved):
+    assert load_policy(forge(saved, {"observation": EARLIER_LAYOUTS[0]})).squash
+
+
 # --- its file ---
 
 
@@ -106,9 +134,9 @@ def test_a_policy_is_read_back_to_the_last_bit(policy, saved):
     again = load_policy(saved)
     assert (again.squash, again.about) == (policy.squash, ABOUT)
     ours, theirs = jax.tree.leaves(policy), jax.tree.leaves(again)
-    assert len(ours) == len(theirs) == 7
+    assert len(ours) == len(theirs) == 8
     for one, other in zip(ours, theirs, strict=True):
-        assert one.dtype == other.dtype
+        assert np.asarray(one).dtype == np.asarray(other).dtype
         np.testing.assert_array_equal(one, other)
 
 

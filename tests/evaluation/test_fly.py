@@ -14,8 +14,11 @@ from flytune.config.pytree import pytree, static
 from flytune.control.controller import Controller
 from flytune.errors import BadInput, Diverged
 from flytune.evaluation.fly import fly
+from flytune.evaluation.judge import judge
 from flytune.physics.dynamics import hovering
+from flytune.runs.find import find_controller
 from flytune.task.files import load_task
+from flytune.task.initial_state import InitialState
 from flytune.task.situation import situation
 from flytune.task.termination import margins
 
@@ -359,3 +362,29 @@ def test_a_controller_that_cannot_be_flown_is_refused_in_one_line(task, controll
 def test_options_beside_a_simulator_of_ones_own_are_refused(task):
     with pytest.raises(BadInput, match="simulator_options: are not allowed with a simulator of your own"):
         fly(Echo(gain=0.0), task, simulator=lambda vehicle, number: None, simulator_options={"physics_steps": 2})
+
+
+@pytest.mark.parametrize("name", ["baseline-refined", "acrobatic-refined", "dial"])
+def test_a_policy_that_ships_does_the_same_at_every_heading(name):
+    found = find_controller(name)
+    turned = find_controller(name, load_task(name, {"target.yaw": 2.0}).at())
+    there = judge(fly(found, found.task.at(), trials=20)).settling_time["position"]
+    here = judge(fly(turned, turned.task, trials=20)).settling_time["position"]
+    assert np.isfinite(there).all() and np.isfinite(here).all()
+    # the starts are others, since their box does not turn with the target
+    assert np.median(here) == pytest.approx(np.median(there), rel=0.1)
+
+
+def test_a_far_target_is_approached_by_a_policy_and_not_crashed_into():
+    task = load_task("dial").at()
+    starts = InitialState(
+        lowest_position=(-20.0, -0.5, 1.0), highest_position=(-20.0, 0.5, 1.0), largest_tilt=0.1, largest_yaw=3.0
+    )
+    flights = fly(find_controller("dial"), task, trials=10, duration=40.0, initial_conditions=starts)
+    judged = judge(flights)
+    assert judged.settled("position") == 10 and not judged.crashed.any()
+    assert judged.peak_speed.max() < 0.8
+    assert flights.initial_conditions == "own"
+    free = dataclasses.replace(find_controller("dial").controller, error_limit=np.inf)
+    lost = judge(fly(free, task, trials=10, duration=40.0, initial_conditions=starts))
+    assert lost.settled("position") < 10  # what the limit is for

@@ -1,5 +1,7 @@
 """A policy as an ONNX file: its content, its actions, and its flights, which are those of the policy."""
 
+import dataclasses
+import math
 import re
 import subprocess
 import sys
@@ -55,8 +57,8 @@ def exported(policy, tmp_path):
 def test_the_file_gives_the_actions_of_the_policy_for_ten_thousand_observations_every_squash_and_size(tmp_path):
     observations = sample_observations(10_000)
     sizes = [((), "tanh"), ((8,), "clip"), ((64, 64), "clip"), ((64, 64), "tanh"), ((32, 16, 8), "tanh")]
-    for hidden, squash in sizes:
-        policy = make_policy(hidden, squash)
+    for limit, (hidden, squash) in zip([math.inf, 0.1, 3.02, math.inf, 30.0], sizes, strict=True):
+        policy = dataclasses.replace(make_policy(hidden, squash), error_limit=limit)
         save_onnx(tmp_path / "policy.onnx", policy)
         model = onnxruntime.InferenceSession(tmp_path / "policy.onnx", providers=["CPUExecutionProvider"])
         (actions,) = model.run(["action"], {"observation": observations})

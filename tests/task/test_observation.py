@@ -46,7 +46,26 @@ def test_without_noise_the_layout_is_position_error_attitude_velocity_rate_and_l
     np.testing.assert_allclose(seen, expected, atol=1e-6)
 
 
-def test_the_velocity_is_seen_in_the_inertial_frame_whatever_the_attitude():
+@pytest.mark.parametrize("yaw", [-math.pi, -2.0, 0.5, math.pi / 2, 3.0])
+def test_position_error_and_velocity_are_seen_in_axes_that_turn_with_the_heading_of_the_target(yaw):
+    error, velocity = (0.5, -1.5, 1.25), (0.1, 0.2, 0.3)
+    seen = see(state(velocity=velocity), target=dataclasses.replace(TARGET, yaw=yaw))
+    back = Rotation.from_euler("z", -yaw)
+    np.testing.assert_allclose(seen[:3], back.apply(error), atol=1e-6)
+    np.testing.assert_allclose(seen[7:10], back.apply(velocity), atol=1e-6)
+    np.testing.assert_allclose(seen[10:13], [1, 2, 3], atol=1e-6)  # the body rate is the body's own
+
+
+def test_at_yaw_zero_position_error_and_velocity_are_those_of_the_inertial_frame_bit_by_bit():
+    rng = np.random.default_rng(0)
+    for _ in range(20):
+        position, velocity = (tuple(rng.normal(0, 3, 3).astype(np.float32)) for _ in range(2))
+        seen = see(state(position=position, velocity=velocity))
+        np.testing.assert_array_equal(seen[7:10], np.float32(velocity))
+        np.testing.assert_array_equal(seen[:3], np.float32(position) - np.float32(TARGET.position))
+
+
+def test_the_velocity_is_seen_in_the_heading_frame_whatever_the_attitude():
     seen = see(state(attitude=(0, 0, 1, 0)))
     np.testing.assert_allclose(seen[7:10], [0.1, 0.2, 0.3], rtol=1e-6)
 
