@@ -94,13 +94,26 @@ def test_another_algorithm_or_another_size_is_refused(make_model, tmp_path):
         ("observations", {"observations": 12}, r"observation_space \[12\]"),
         ("actions", {"actions": 3}, r"action_space \[3\]"),
         ("reach", {"reach": 0.5}, "actions from"),
+        ("row", {"observations": (1, 12)}, r"observation_space \[1, 12\]"),
+        ("two", {"observations": (2, 17)}, r"observation_space \[2, 17\]"),
+        ("square", {"actions": (2, 2)}, r"action_space \[2, 2\]"),
+        ("row_reach", {"actions": (1, 4), "reach": 0.5}, r"actions from \['-0.5', '-0.5', '-0.5', '-0.5'\]"),
     ]:
         make_model(room(**size)).save(tmp_path / f"{name}.zip")
         with pytest.raises(BadInput, match=complaint):
             load_sb3(tmp_path / f"{name}.zip")
     SAC("MlpPolicy", room(), device="cpu", buffer_size=10).save(tmp_path / "sac.zip")
-    with pytest.raises(BadInput, match="custom policy"):
+    with pytest.raises(BadInput, match="the policy of another algorithm, or a custom policy"):
         load_sb3(tmp_path / "sac.zip")
+
+
+@pytest.mark.parametrize(("observations", "actions"), [((1, 17), (1, 4)), ((17, 1), (4,)), ((1, 1, 17), (4, 1))])
+def test_the_same_numbers_in_rows_or_columns_are_the_same_policy(make_model, tmp_path, observations, actions):
+    room = type(make_model().get_env().envs[0].unwrapped)
+    model = make_model(room(observations=observations, actions=actions), policy_kwargs={"net_arch": [8, 8]})
+    model.save(tmp_path / "model.zip")
+    wanted, _ = model.predict(OBSERVATIONS.reshape(-1, *observations), deterministic=True)
+    np.testing.assert_allclose(act(load_sb3(tmp_path / "model.zip")), wanted.reshape(-1, 4), rtol=0, atol=5e-6)
 
 
 @pytest.mark.parametrize(

@@ -59,7 +59,8 @@ def rounding_bound(policy: Policy, observations: Float[np.ndarray, "batch 17"]) 
 
     Source: Higham 2002, Accuracy and Stability of Numerical Algorithms, section 3.1; the mean value theorem.
     """
-    x = observations.astype(float) * np.asarray(policy.input_scale, float)
+    clipped = observations if policy.bounds is None else np.clip(observations, *np.asarray(policy.bounds))
+    x = clipped.astype(float) * np.asarray(policy.input_scale, float)
     error = UNIT_ROUNDOFF * np.abs(x)
     if policy.inputs:
         further = np.asarray(told(policy.inputs, jnp.asarray(observations), policy.setting), float)[:, SIZE:]
@@ -121,7 +122,11 @@ def _model(policy: Policy) -> Any:
         nodes.append(helper.make_node(operator, inputs, [output], name=output, **attributes))
         return output
 
-    value = node("Mul", INPUT, weight("input_scale", policy.input_scale), output="scaled")
+    value = INPUT
+    if policy.bounds is not None:
+        value = node("Max", value, weight("lowest", policy.bounds[0]), output="above")
+        value = node("Min", value, weight("highest", policy.bounds[1]), output="within")
+    value = node("Mul", value, weight("input_scale", policy.input_scale), output="scaled")
     if policy.inputs:
         value = node("Concat", value, *_further_inputs(policy, node, weight), output="inputs", axis=1)
     last = len(policy.actor.weights) - 1
