@@ -341,8 +341,9 @@ def test_make_and_make_vec_keep_a_time_limit_below_the_horizon(mode):
 
 
 def test_a_time_limit_that_is_none_is_refused_and_one_beyond_the_horizon_changes_nothing():
-    with pytest.raises(BadInput, match="max_episode_steps: 0"):
-        HoverVectorEnv(NUMBER, max_episode_steps=0)
+    for wrong in (0, -3, 2.5, "10"):
+        with pytest.raises(BadInput, match=f"max_episode_steps: {wrong!r} is not allowed"):
+            HoverVectorEnv(NUMBER, max_episode_steps=wrong)
     task = load_task("baseline", {"horizon": 4})
     assert HoverVectorEnv(NUMBER, task=task, max_episode_steps=9).task.horizon == 4
 

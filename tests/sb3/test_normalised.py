@@ -19,6 +19,7 @@ from tests.command import refused
 
 from flytune.adapters.gymnasium import HoverEnv
 from flytune.adapters.vec_env import HoverVecEnv
+from flytune.cli.main import main
 from flytune.control.policy import load_policy, save_policy
 from flytune.errors import BadInput
 from flytune.export.onnx import load_onnx, save_onnx
@@ -109,6 +110,23 @@ def test_models_of_raw_observations_are_not_taken_for_scaled_ones(folder):
     place = folder(raw__zip="raw.zip", rewards__zip="rewards.zip", vecnormalize__pkl="scaled.pkl")
     for name in ("raw", "rewards"):  # statistics of some other model stand beside them
         assert load_sb3(place / f"{name}.zip").bounds is None
+
+
+def test_a_trained_model_that_does_not_say_flies_and_says_that_it_does_not(made, tmp_path):
+    PPO.load(made / "raw.zip", device="cpu").save(tmp_path / "bare.zip", exclude=["_last_obs", "_last_original_obs"])
+    assert "does not say whether they were scaled" in load_sb3(tmp_path / "bare.zip").about["observations"]
+
+
+def test_a_scaled_model_is_exported_from_the_command_line(folder, made, monkeypatch, capsys):
+    pytest.importorskip("onnxruntime", reason="needs flytune[onnx]")
+    place = folder(m__zip="scaled.zip", named__pkl="scaled.pkl")
+    monkeypatch.chdir(place)
+    assert main(["export", "m.zip@vecnormalize=named.pkl", "--format", "onnx", "--out", "m.onnx"]) == 0
+    found = load_onnx(place / "m.onnx").session(OBSERVATIONS)
+    np.testing.assert_allclose(found, wanted(made, "scaled"), rtol=0, atol=1e-4)
+    capsys.readouterr()
+    assert "nothing.pkl: cannot be read" in refused("evaluate", "m.zip@vecnormalize=nothing.pkl", capsys=capsys)
+    assert "gone.zip: no such file" in refused("evaluate", "gone.zip@vecnormalize=named.pkl", capsys=capsys)
 
 
 def test_a_model_that_does_not_say_needs_an_answer_where_statistics_stand_beside_it(folder, made):

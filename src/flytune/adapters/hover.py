@@ -27,19 +27,19 @@ TRAIL = 300  # steps of the way behind a vehicle that a picture shows
 FARTHEST = 1000.0  # m, also rad: of a start given by hand
 
 
-def read_task(task: str | Path | Task, edits: dict[str, Any] | None, max_episode_steps: int | None = None) -> Task:
+def read_task(task: str | Path | Task, edits: dict[str, Any] | None, max_episode_steps: Any = None) -> Task:
     """The task by preset name or file, edited, or the Task itself; its horizon is at most `max_episode_steps`.
 
     Raises:
         BadInput: no such task, or edits of a Task.
     """
     if max_episode_steps is not None:
-        if max_episode_steps < 1:
+        if not isinstance(max_episode_steps, int | np.integer) or max_episode_steps < 1:
             raise BadInput(
-                f"max_episode_steps: {max_episode_steps} is not allowed. Allowed: a whole number, 1 or more."
+                f"max_episode_steps: {max_episode_steps!r} is not allowed. Allowed: a whole number, 1 or more."
             )
         whole = read_task(task, edits)
-        return dataclasses.replace(whole, horizon=min(int(whole.horizon), max_episode_steps))
+        return dataclasses.replace(whole, horizon=min(int(whole.horizon), int(max_episode_steps)))
     if not isinstance(task, Task):
         return load_task(task, edits)
     if edits:

@@ -78,6 +78,9 @@ def load_sb3(path: Path, statistics: Path | Literal["none"] | None = None) -> Po
         about={"trainer": f"Stable-Baselines3 {version[:40]}"},
     )
     found = _statistics(path, about, statistics)
+    if found is None and about.get("_last_obs") is None and about.get("num_timesteps"):
+        said = "taken as they are: the file does not say whether they were scaled"
+        return dataclasses.replace(policy, about=policy.about | {"observations": said})
     if found is None:
         return policy
     policy = dataclasses.replace(policy, about=policy.about | {"observations": f"scaled by {Path(found.source).name}"})
@@ -227,14 +230,15 @@ def _unknown_kind(about: Any) -> str | None:
         return f"has the activation {activation}, allowed: tanh."
     custom = set(options) - HARMLESS - {":type:", ":serialized:", "use_sde", "squash_output"}
     if custom:
-        return f"was made with policy_kwargs {str(sorted(custom))[:120]}, allowed: net_arch."
+        return f"was made with policy_kwargs {str(sorted(custom))[:120]}, allowed: {', '.join(sorted(HARMLESS))}."
     for name, size in (("observation_space", SIZE), ("action_space", 4)):
         space = about.get(name)
         found = space.get("_shape") if isinstance(space, dict) else None
         # the same numbers in a row or a column: gym-pybullet-drones gives every model the shapes [1, N] and [1, 4]
         if not isinstance(found, list) or [length for length in found if length != 1] != [size]:
             kind = str(space.get(":type:"))[:80] if found is None and isinstance(space, dict) else found
-            return f"has {name} {str(kind)[:80]}, allowed: [{size}], or [1, {size}]."
+            other = " examples/gym_pybullet_drones.py shows how to fly another layout." if size == SIZE else ""
+            return f"has {name} {str(kind)[:80]}, allowed: [{size}], or [1, {size}].{other}"
     low, high = (str(about["action_space"].get(end)).replace("[", " ").replace("]", " ").split() for end in ENDS)
     if low != ["-1."] * 4 or high != ["1."] * 4:
         return f"has actions from {low} to {high}, allowed: -1 to 1."
