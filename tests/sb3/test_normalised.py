@@ -179,6 +179,16 @@ def test_what_the_checkpoint_callback_writes_is_found(tmp_path):
     assert load_sb3(tmp_path / "hover_512_steps.zip").about["observations"].endswith("hover_vecnormalize_512_steps.pkl")
 
 
+def test_the_folders_of_rl_zoo_are_known_and_several_of_them_are_not_guessed_among(folder):
+    place = folder(best_model__zip="scaled.zip", vecnormalize__pkl="scaled.pkl")
+    (place / "flytune-Hover-v0").mkdir()
+    (place / "vecnormalize.pkl").rename(place / "flytune-Hover-v0" / "vecnormalize.pkl")
+    assert load_sb3(place / "best_model.zip").bounds is not None
+    shutil.copytree(place / "flytune-Hover-v0", place / "another")
+    with pytest.raises(BadInput, match="Give the statistics"):
+        load_sb3(place / "best_model.zip")
+
+
 def test_the_wrapper_of_gymnasium_is_seen_and_flies_with_the_arrays_of_the_page(tmp_path):
     env = gymnasium.wrappers.NormalizeObservation(HoverEnv(edits={"horizon": 40}))
     model = learned(DummyVecEnv([lambda: env]), n_steps=64)

@@ -110,14 +110,17 @@ def refuse_misfit(statistics: Statistics, last: np.ndarray | None) -> None:
 
 
 def find_statistics(model: Path) -> Path | None:
-    """The file of statistics that stands beside a model under one of the usual names, if any."""
+    """The file of statistics that stands beside a model under one of the usual names, or in the only folder there."""
     stem, steps = model.stem, re.fullmatch(r"(.*)_(\d+_steps)", model.stem)
     names = [f"{stem}_vecnormalize", f"{stem}.vecnormalize"]
     if steps:  # of the callback that saves checkpoints
         names.append(f"{steps[1]}_vecnormalize_{steps[2]}")
     names += ["vecnormalize", "vec_normalize"]
-    places = (model.with_name(f"{name}{end}") for name in names for end in (".pkl", ".npz"))
-    return next((place for place in places if place.is_file()), None)
+    places = [model.with_name(f"{name}{end}") for name in names for end in (".pkl", ".npz")]
+    below = sorted(
+        model.parent.glob("*/vecnormalize.pkl")
+    )  # where RL Zoo keeps it, in a folder named as the environment
+    return next((place for place in places + below[:1] * (len(below) == 1) if place.is_file()), None)
 
 
 def read_statistics(path: Path) -> Statistics | None:
