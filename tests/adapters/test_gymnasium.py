@@ -1,5 +1,7 @@
 """flytune/Hover-v0: what Gymnasium and its users expect of an environment."""
 
+import copy
+import pickle
 import re
 import subprocess
 import sys
@@ -58,7 +60,9 @@ def random_actions(steps, *shape):
 
 
 @pytest.mark.parametrize("render_mode", [None, "rgb_array"])
-def test_check_env_finds_nothing_to_say(quiet, render_mode):
+def test_check_env_says_only_that_the_observation_is_unbounded(quiet, render_mode):
+    for infinite in ("minimum value is -infinity", "maximum value is infinity"):
+        warnings.filterwarnings("ignore", message=f".*A Box observation space {infinite}")
     check_env(gymnasium.make("flytune/Hover-v0", render_mode=render_mode).unwrapped)
 
 
@@ -109,6 +113,13 @@ def test_the_vector_env_is_what_make_vec_makes_and_says_how_it_resets(quiet):
         NUMBER,
         17,
     )
+
+
+def test_every_door_has_the_same_spaces():
+    one, many = HoverEnv(), HoverVectorEnv(NUMBER)
+    assert one.observation_space == many.single_observation_space == gymnasium.spaces.Box(-np.inf, np.inf, (17,))
+    assert one.action_space == many.single_action_space == gymnasium.spaces.Box(-1, 1, (4,))
+    assert many.observation_space.shape == (NUMBER, 17) and many.action_space.shape == (NUMBER, 4)
 
 
 # --- one environment ---
@@ -288,6 +299,96 @@ def test_when_all_end_at_once_infos_still_have_the_form_of_gymnasium_s_own():
     assert forms[0] == forms[1]
 
 
+def flown(envs, disabled):
+    """All that twenty steps give, infos in plain form; where nothing resets by itself, the ended are reset."""
+    seen = [envs.reset(seed=0)]
+    for actions in random_actions(20, 1).repeat(NUMBER, axis=1):
+        seen.append(envs.step(actions))
+        ended = seen[-1][2] | seen[-1][3]
+        if disabled and ended.any():
+            with pytest.raises((ResetNeeded, AssertionError)):
+                envs.step(actions)
+            seen.append(envs.reset(options={"reset_mask": ended}))
+    return seen
+
+
+@pytest.mark.parametrize("mode", AutoresetMode, ids=lambda mode: mode.name)
+def test_each_autoreset_mode_gives_what_gymnasium_s_own_vector_env_gives(mode):
+    # the same start each time and no noise, so that all numbers are those of the single environment
+    edits = QUIET | FIXED | {"horizon": 6}
+    ours = gymnasium.make_vec("flytune/Hover-v0", num_envs=NUMBER, edits=edits, autoreset_mode=mode)
+    own = SyncVectorEnv([lambda: HoverEnv(edits=edits)] * NUMBER, autoreset_mode=mode)
+    assert ours.metadata["autoreset_mode"] is own.metadata["autoreset_mode"] is mode
+    found, wanted = (flown(envs, mode is AutoresetMode.DISABLED) for envs in (ours, own))
+    assert any(step[3].all() for step in wanted if len(step) == 5)
+    for mine, theirs in zip(found, wanted, strict=True):
+        for one, other in zip(mine[:-1], theirs[:-1], strict=True):
+            np.testing.assert_allclose(one, other, rtol=1e-4, atol=1e-4)
+        assert structure(mine[-1], np.ones(NUMBER, bool)) == structure(theirs[-1], np.ones(NUMBER, bool))
+
+
+def test_an_autoreset_mode_that_does_not_exist_is_refused():
+    for mode in ("next_step", "Never", 3, None):
+        with pytest.raises(BadInput, match=r"^autoreset_mode: .* Allowed: NEXT_STEP, SAME_STEP, DISABLED\.$"):
+            HoverVectorEnv(NUMBER, autoreset_mode=mode)
+    assert HoverVectorEnv(NUMBER, autoreset_mode="NextStep").autoreset_mode is AutoresetMode.NEXT_STEP
+
+
+@pytest.mark.parametrize("mode", ["vector_entry_point", "sync"])
+def test_make_and_make_vec_keep_a_time_limit_below_the_horizon(mode):
+    envs = gymnasium.make_vec("flytune/Hover-v0", num_envs=NUMBER, vectorization_mode=mode, max_episode_steps=3)
+    envs.reset(seed=0)
+    ends = [envs.step(np.zeros((NUMBER, 4)))[3].all() for _ in range(3)]
+    assert ends == [False, False, True]
+
+
+def test_a_time_limit_that_is_none_is_refused_and_one_beyond_the_horizon_changes_nothing():
+    for wrong in (0, -3, 2.5, "10"):
+        with pytest.raises(BadInput, match=f"max_episode_steps: {wrong!r} is not allowed"):
+            HoverVectorEnv(NUMBER, max_episode_steps=wrong)
+    task = load_task("baseline", {"horizon": 4})
+    assert HoverVectorEnv(NUMBER, task=task, max_episode_steps=9).task.horizon == 4
+
+
+def test_starts_of_many_can_be_given_one_for_all_or_one_for_each():
+    envs = HoverVectorEnv(NUMBER, edits=QUIET)
+    observations, _ = envs.reset(seed=0, options={"position": [0.1, 0.2, 1.3], "yaw": np.pi / 2})
+    expected = [0.1, 0.2, 0.3, 0, 0, np.sqrt(0.5), np.sqrt(0.5)]
+    np.testing.assert_allclose(observations[:, :7], [expected] * NUMBER, atol=1e-6)
+    each = np.linspace(0.5, 1.0, NUMBER)[:, None] * [1.0, 0.0, 1.0]
+    mask = np.arange(NUMBER) % 2 == 0
+    later, _ = envs.reset(options={"position": each, "yaw": np.zeros(NUMBER), "reset_mask": mask})
+    np.testing.assert_allclose(later[mask, :3], each[mask] - [0, 0, 1], atol=1e-6)
+    np.testing.assert_array_equal(later[~mask], observations[~mask])
+    with pytest.raises(BadInput, match=f"three numbers, or {NUMBER} times as many"):
+        envs.reset(options={"position": np.zeros((2, 3))})
+
+
+@pytest.mark.parametrize("make", [HoverEnv, lambda **given: HoverVectorEnv(NUMBER, **given)], ids=["one", "many"])
+@pytest.mark.parametrize("copied", [copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))], ids=["copy", "pickle"])
+def test_a_copy_goes_on_as_the_original_does_and_apart_from_it(make, copied):
+    env = make(edits={"horizon": 3}, render_mode="rgb_array")
+    env.reset(seed=5)
+    env.step(np.full(env.action_space.shape, 0.1))
+    twin = copied(env)
+    flights = []
+    for each in (env, twin):
+        each.step(np.zeros(env.action_space.shape))
+        flights.append([each.reset()[0], each.step(np.zeros(env.action_space.shape))[0], *np.array(each.render())])
+    for mine, theirs in zip(*flights, strict=True):
+        np.testing.assert_array_equal(mine, theirs)
+
+
+@pytest.mark.parametrize("simulator", ["pybullet", "mujoco"])
+def test_an_environment_of_another_simulator_is_not_copied_half(simulator):
+    pytest.importorskip(simulator, reason=f"needs flytune[{simulator}]")
+    env = HoverEnv(simulator=simulator)
+    for copied in (copy.deepcopy, pickle.dumps):
+        with pytest.raises(BadInput, match="cannot be copied or pickled"):
+            copied(env)
+    env.close()
+
+
 def test_the_vector_env_s_seed_and_mask():
     envs = HoverVectorEnv(NUMBER)
     first, _ = envs.reset(seed=9)
@@ -301,8 +402,8 @@ def test_the_vector_env_s_seed_and_mask():
     for wrong in (np.array([True]), np.zeros(NUMBER, bool), np.ones(NUMBER)):
         with pytest.raises(BadInput, match="reset_mask"):
             envs.reset(options={"reset_mask": wrong})
-    with pytest.raises(BadInput, match="position"):
-        envs.reset(options={"position": [0, 0, 1]})
+    with pytest.raises(BadInput, match="positions: is unknown"):
+        envs.reset(options={"positions": [0, 0, 1]})
 
 
 # --- misuse ---

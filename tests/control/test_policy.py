@@ -140,6 +140,17 @@ def test_a_policy_is_read_back_to_the_last_bit(policy, saved):
         np.testing.assert_array_equal(one, other)
 
 
+def test_a_policy_with_bounds_clips_its_observation_and_is_read_back_with_them(policy, observations, tmp_path):
+    bounds = jnp.stack([jnp.full(17, -0.5), jnp.linspace(0.1, 2, 17)])
+    bounded = dataclasses.replace(policy, bounds=bounds)
+    np.testing.assert_array_equal(bounded(observations), policy(jnp.clip(observations, bounds[0], bounds[1])))
+    save_policy(tmp_path / "p.safetensors", bounded)
+    np.testing.assert_array_equal(load_policy(tmp_path / "p.safetensors")(observations), bounded(observations))
+    for damaged in (bounds[::-1], bounds[:, :12], bounds[0], bounds * np.nan):
+        forge(tmp_path / "p.safetensors", change_tensors={"bounds": np.asarray(damaged)})
+        assert "its bounds are damaged" in refusal(tmp_path / "p.safetensors")
+
+
 @pytest.mark.parametrize("hidden", [(), (8,), (8, 5, 9)])
 def test_a_network_of_another_depth_is_read_back(tmp_path, observations, hidden):
     sizes = (17, *hidden, 4)

@@ -17,6 +17,7 @@ from flytune.control.controller import Controller
 from flytune.control.policy import ACTION, Network, Policy, make_network
 from flytune.errors import BadInput
 from flytune.evaluation.fly import fly
+from flytune.runs.find import find_controller
 from flytune.task.files import load_task, preset_names, read_task_text, write_task
 from flytune.task.observation import LAYOUT, SIZE
 
@@ -220,3 +221,20 @@ def test_the_python_of_the_documentation_flies_the_file(exported, policy):
     assert vehicle == policy.about["vehicle"]
     expected = policy(jnp.zeros(17).at[0].set(0.5).at[6].set(1.0))
     np.testing.assert_allclose(np.fromstring(numbers.strip(" []\n"), sep=" "), expected, rtol=1e-4)
+
+
+def test_the_operators_of_an_exported_graph_are_those_that_the_page_names(tmp_path):
+    page = (Path(__file__).parents[2] / "docs" / "how-to" / "onnx.md").read_text(encoding="utf-8").replace("\n", " ")
+    five = re.search(r"five of them .*?\((.*?)\)", page)[1]
+    dials, scaled = (re.search(rf"{who} has (.*?)(?: as well|\.)", page)[1] for who in ("with dials", "VecNormalize"))
+    used = {}
+    for name in ("baseline-refined", "dial"):
+        save_onnx(tmp_path / "p.onnx", find_controller(name).controller)
+        used[name] = {node.op_type for node in onnx.load(tmp_path / "p.onnx").graph.node}
+    assert used["baseline-refined"] == set(five.split(", "))
+    formulas = {"Div", "Log"}  # of the preset `dial`
+    assert used["dial"] == used["baseline-refined"] | set(re.findall(r"[A-Z]\w+", dials)) | formulas
+    policy = find_controller("baseline-refined").controller
+    save_onnx(tmp_path / "p.onnx", dataclasses.replace(policy, bounds=jnp.stack([-jnp.ones(17), jnp.ones(17)])))
+    bounded = {node.op_type for node in onnx.load(tmp_path / "p.onnx").graph.node}
+    assert bounded == used["baseline-refined"] | set(re.findall(r"[A-Z]\w+", scaled))

@@ -17,8 +17,9 @@ class Room(gymnasium.Env):
     """An environment with flytune's spaces in which nothing happens; a model needs one to be made."""
 
     def __init__(self, observations=17, actions=4, reach=1.0):
-        self.observation_space = spaces.Box(-np.inf, np.inf, (observations,), np.float32)
-        self.action_space = spaces.Box(-reach, reach, (actions,), np.float32)
+        shape = (observations,) if isinstance(observations, int) else observations
+        self.observation_space = spaces.Box(-np.inf, np.inf, shape, np.float32)
+        self.action_space = spaces.Box(-reach, reach, (actions,) if isinstance(actions, int) else actions, np.float32)
 
     def reset(self, *, seed=None, options=None):
         super().reset(seed=seed)

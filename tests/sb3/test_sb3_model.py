@@ -94,13 +94,26 @@ def test_another_algorithm_or_another_size_is_refused(make_model, tmp_path):
         ("observations", {"observations": 12}, r"observation_space \[12\]"),
         ("actions", {"actions": 3}, r"action_space \[3\]"),
         ("reach", {"reach": 0.5}, "actions from"),
+        ("row", {"observations": (1, 12)}, r"observation_space \[1, 12\]"),
+        ("two", {"observations": (2, 17)}, r"observation_space \[2, 17\]"),
+        ("square", {"actions": (2, 2)}, r"action_space \[2, 2\]"),
+        ("row_reach", {"actions": (1, 4), "reach": 0.5}, r"actions from \['-0.5', '-0.5', '-0.5', '-0.5'\]"),
     ]:
         make_model(room(**size)).save(tmp_path / f"{name}.zip")
         with pytest.raises(BadInput, match=complaint):
             load_sb3(tmp_path / f"{name}.zip")
     SAC("MlpPolicy", room(), device="cpu", buffer_size=10).save(tmp_path / "sac.zip")
-    with pytest.raises(BadInput, match="custom policy"):
+    with pytest.raises(BadInput, match="the policy of another algorithm, or a custom policy"):
         load_sb3(tmp_path / "sac.zip")
+
+
+@pytest.mark.parametrize(("observations", "actions"), [((1, 17), (1, 4)), ((17, 1), (4,)), ((1, 1, 17), (4, 1))])
+def test_the_same_numbers_in_rows_or_columns_are_the_same_policy(make_model, tmp_path, observations, actions):
+    room = type(make_model().get_env().envs[0].unwrapped)
+    model = make_model(room(observations=observations, actions=actions), policy_kwargs={"net_arch": [8, 8]})
+    model.save(tmp_path / "model.zip")
+    wanted, _ = model.predict(OBSERVATIONS.reshape(-1, *observations), deterministic=True)
+    np.testing.assert_allclose(act(load_sb3(tmp_path / "model.zip")), wanted.reshape(-1, 4), rtol=0, atol=5e-6)
 
 
 @pytest.mark.parametrize(
@@ -122,6 +135,51 @@ def test_weights_that_do_not_fit_together_or_are_not_finite_are_refused(saved, n
     with pytest.raises(BadInput, match=complaint) as refusal:
         load_sb3(saved)
     assert len(str(refusal.value).splitlines()) == 1
+
+
+def altered(path, fault):
+    """The model with a fault in its description (keys, value) or in its tensors (name, tensor)."""
+    keys, new = fault
+    if isinstance(keys, str):
+        return rewritten(path, {"policy.pth": torch_file(weights(path) | {keys: new})})
+    about = json.loads(zipfile.ZipFile(path).read("data"))
+    inside = about
+    for key in keys[:-1]:
+        inside = inside[key]
+    inside[keys[-1]] = new
+    return rewritten(path, {"data": json.dumps(about).encode()})
+
+
+RELU = "<class 'torch.nn.modules.activation.ReLU'>"
+FAULTS = {
+    "custom policy (module 'stable_baselines3.sac.policies')": (
+        ("policy_class", "__module__"), "stable_baselines3.sac.policies",
+    ),
+    "explores by gSDE": (("use_sde",), True),
+    "squashes its output": (("policy_kwargs", "squash_output"), True),
+    "activation <class 'torch.nn.modules.activation.ReLU'>": (("policy_kwargs", "activation_fn"), RELU),
+    "policy_kwargs ['features_extractor_class']": (("policy_kwargs", "features_extractor_class"), "Mine"),
+    "observation_space [1, 12]": (("observation_space", "_shape"), [1, 12]),
+    "action_space [2]": (("action_space", "_shape"), [2]),
+    "actions from ['-2.', '-1.', '-1.', '-1.']": (("action_space", "low"), "[-2. -1. -1. -1.]"),
+    "log_std holds numbers that are not finite": ("log_std", torch.full((4,), torch.inf)),
+    "action_net has shape (4, 9)": ("action_net.weight", torch.zeros(4, 9)),
+    "another architecture": ("features_extractor.cnn.0.weight", torch.zeros(4, 8)),
+    "DoubleStorage": ("value_net.bias", torch.zeros(1, dtype=torch.float64)),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("first", FAULTS)
+def test_of_two_faults_one_is_named_and_it_is_there(saved, tmp_path, first):
+    for second in FAULTS:
+        path = tmp_path / "faulty.zip"
+        path.write_bytes(saved.read_bytes())
+        for fault in {first, second}:
+            altered(path, FAULTS[fault])
+        with pytest.raises(BadInput) as caught:
+            load_sb3(path)
+        line = str(caught.value)
+        assert any(fault in line for fault in (first, second)) and len(line.splitlines()) == 1, f"{second}: {line}"
 
 
 class Trap:

@@ -7,16 +7,22 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from flytune.adapters import registration
-from flytune.adapters.hover import METADATA, Pictures, make_spaces, read_action, read_mask, read_start, read_task
+from flytune.adapters.hover import (
+    METADATA,
+    Pictures,
+    make_spaces,
+    read_action,
+    read_mask,
+    read_starts,
+    read_task,
+    refuse_unknown,
+    start_at,
+)
 from flytune.errors import BadInput, require
-from flytune.physics.dynamics import hovering
-from flytune.physics.rotation import from_euler
-from flytune.simulation.host import HostEnvironment, Transition, draw_episodes, episodes_at
-from flytune.simulation.simulator import state_numbers
+from flytune.simulation.host import HostEnvironment, Transition, draw_episodes
 from flytune.simulation.simulators import make_simulator
 from flytune.task.observation import NOISY
 from flytune.task.task import Task
@@ -82,9 +88,13 @@ class HoverEnv(gymnasium.Env[np.ndarray, np.ndarray]):
             BadInput: an unknown option or an impossible start.
         """
         super().reset(seed=seed)
-        start, seed = read_start(options), int(self.np_random.integers(2**32))
-        episodes = draw_episodes(self.task, jax.random.key(seed)[None]) if start is None else self._at(**start)
-        observation = self._environment.start(episodes, self._noise())[0]
+        refuse_unknown(options, "position", "yaw")
+        starts, drawn = read_starts(options, 1), int(self.np_random.integers(2**32))
+        if starts is None:
+            episodes = draw_episodes(self.task, jax.random.key(drawn)[None])
+            observation = self._environment.start(episodes, self._noise())[0]
+        else:
+            observation = start_at(self._environment, starts, self._noise())[0]
         self._reward, self._missing_reset = np.zeros(1), None
         self._pictures.follow(self._environment)
         return observation, {}
@@ -121,12 +131,6 @@ class HoverEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         """Free the memory of the simulator."""
         self._environment.close()
 
-    def _at(self, position: Any, yaw: float) -> Any:
-        """The episode that begins level and at rest at a position in m and a yaw in rad."""
-        about_z = from_euler(*map(jnp.float32, (0.0, 0.0, yaw)))
-        states = state_numbers(hovering(self.task.vehicle, tuple(position), about_z))
-        return episodes_at(self.task, states[:, None])
-
     def _noise(self) -> np.ndarray:
         return self.np_random.standard_normal((NOISY, 1), dtype=np.float32)
 
@@ -134,10 +138,23 @@ class HoverEnv(gymnasium.Env[np.ndarray, np.ndarray]):
 class HoverVectorEnv(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
     """Many vehicles that are to hover, stepped by one compiled call.
 
-    An environment that ends starts anew in the same step (`AutoresetMode.SAME_STEP`): the observation is then the new
-    episode's, and `final_obs` and `final_info` of the infos hold the last ones of the old episode.
+    An environment that ends starts anew in the same step: the observation is then the new episode's, and `final_obs`
+    and `final_info` of the infos hold the last ones of the old episode. Other modes are those of Gymnasium: with
+    `NEXT_STEP` the step after the end begins the new episode, whatever the action; with `DISABLED` the caller resets
+    those that ended.
 
-    There are `num_envs` of them; the other arguments and their errors are those of `HoverEnv`.
+    Args:
+        num_envs: how many.
+        task: as for `HoverEnv`, and so are `edits`, `simulator`, `simulator_options` and `render_mode`.
+        edits: of the task.
+        simulator: its name.
+        simulator_options: of the simulator.
+        render_mode: None, or "rgb_array".
+        max_episode_steps: the time limit of an episode, if it is shorter than the task's horizon.
+        autoreset_mode: an `AutoresetMode`, or its name: "SAME_STEP", "NEXT_STEP" or "DISABLED".
+
+    Raises:
+        BadInput: one of these is not allowed, or the simulator's package is not installed.
     """
 
     metadata = METADATA | {"autoreset_mode": AutoresetMode.SAME_STEP}
@@ -150,10 +167,14 @@ class HoverVectorEnv(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarr
         simulator: str = "flytune",
         simulator_options: dict[str, Any] | None = None,
         render_mode: str | None = None,
+        max_episode_steps: int | None = None,
+        autoreset_mode: AutoresetMode | str = AutoresetMode.SAME_STEP,
     ) -> None:
         if num_envs < 1:
             raise BadInput(f"num_envs: {num_envs} is not allowed. Allowed: a whole number, 1 or more.")
-        self.task = read_task(task, edits)
+        self.autoreset_mode = _read_mode(autoreset_mode)
+        self.metadata = METADATA | {"autoreset_mode": self.autoreset_mode}
+        self.task = read_task(task, edits, max_episode_steps)
         self.render_mode = render_mode
         self._pictures = Pictures(render_mode)
         self.num_envs = num_envs
@@ -161,9 +182,11 @@ class HoverVectorEnv(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarr
         self.observation_space = gymnasium.vector.utils.batch_space(self.single_observation_space, num_envs)
         self.action_space = gymnasium.vector.utils.batch_space(self.single_action_space, num_envs)
         used = make_simulator(simulator, self.task.vehicle, num_envs, simulator_options)
-        self._environment = HostEnvironment(self.task, used, num_envs)
+        ending = "restart" if self.autoreset_mode is AutoresetMode.SAME_STEP else "none"
+        self._environment = HostEnvironment(self.task, used, num_envs, ending)
         self._names = np.array([*causes(self.task.termination), None], dtype=object)  # the last, -1, is SAFE
         self._rewards = np.zeros(num_envs)
+        self._waiting = np.zeros(num_envs, bool)  # ended, and not begun anew
         self._begun = False
 
     def reset(
@@ -172,19 +195,24 @@ class HoverVectorEnv(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarr
         """The observations at new starts, and an empty info; a seed makes everything that follows reproducible.
 
         The option `reset_mask` is a boolean array of the environments to reset; all are reset where it is left out.
+        `position` and `yaw` are as for `HoverEnv`, one start for all of them or one for each ([N, 3] and [N]).
 
         Raises:
-            BadInput: an unknown option, or a mask that is none.
+            BadInput: an unknown option, a mask that is none, or an impossible start.
             ResetNeeded: a mask before the first reset.
         """
         super().reset(seed=seed)
-        mask = read_mask(options, self.num_envs)
+        refuse_unknown(options, "reset_mask", "position", "yaw")
+        mask, starts = read_mask(options, self.num_envs), read_starts(options, self.num_envs)
         if not self._begun and mask is not None:
             raise gymnasium.error.ResetNeeded("reset() with a mask was called before the first full reset.")
         goes_on = self._begun and seed is None  # with the random numbers of the environment
         observation = self._environment.reset(None if goes_on else int(self.np_random.integers(2**32)), mask)
+        if starts is not None:
+            observation = start_at(self._environment, starts, which=mask)
         self._begun = True
-        self._rewards = np.where(True if mask is None else mask, 0.0, self._rewards)
+        chosen = np.ones(self.num_envs, bool) if mask is None else mask
+        self._rewards, self._waiting = np.where(chosen, 0.0, self._rewards), self._waiting & ~chosen
         self._pictures.follow(self._environment)
         return observation, {}
 
@@ -192,23 +220,43 @@ class HoverVectorEnv(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarr
         """The observations, rewards, terminations, truncations and infos of one control period (0.01 s).
 
         Raises:
-            ResetNeeded: before the first reset.
+            ResetNeeded: before the first reset, or with `DISABLED` for an environment that ended.
             InvalidAction: not four finite numbers for each environment.
         """
         if not self._begun:
             raise gymnasium.error.ResetNeeded("step() was called before the first reset. Call reset() first.")
+        waiting = self._waiting
+        if waiting.any() and self.autoreset_mode is AutoresetMode.DISABLED:
+            raise gymnasium.error.ResetNeeded(
+                f"step() was called after the end of episode {int(np.flatnonzero(waiting)[0])}. Call "
+                "reset(options={'reset_mask': terminated | truncated}) first."
+            )
         moved = self._environment.step(read_action(actions, (self.num_envs, 4)))
-        reward, ended = moved.reward, moved.ended
-        self._rewards = np.where(ended, 0.0, reward)
+        reward, terminated, truncated = moved.reward, moved.terminated, moved.truncated
+        if waiting.any():  # with NEXT_STEP, this step begins their next episodes instead
+            self._environment.reset(None, waiting)
+            reward, terminated, truncated = np.where(waiting, 0.0, reward), terminated & ~waiting, truncated & ~waiting
+        ended = terminated | truncated
+        if self.autoreset_mode is AutoresetMode.SAME_STEP:
+            infos, self._rewards = self._infos(moved, ~ended) | self._final(moved, ended), np.where(ended, 0.0, reward)
+        else:
+            infos, self._rewards, self._waiting = self._infos(moved, ~waiting), reward, ended
         self._pictures.follow(self._environment)
-        infos = self._infos(moved, ~ended)
-        if ended.any():
-            final, last = np.full(self.num_envs, None, dtype=object), moved.final_observation
-            for index in np.flatnonzero(ended):
-                final[index] = last[index]
-            infos |= {"final_obs": final, "_final_obs": ended}
-            infos |= {"final_info": self._infos(moved, ended), "_final_info": ended.copy()}
-        return self._environment.observation, reward, moved.terminated, moved.truncated, infos
+        return self._environment.observation, reward, terminated, truncated, infos
+
+    def _final(self, moved: Transition, ended: np.ndarray) -> dict[str, Any]:
+        """What the infos say of environments that ended and have begun anew."""
+        if not ended.any():
+            return {}
+        final, last = np.full(self.num_envs, None, dtype=object), moved.final_observation
+        for index in np.flatnonzero(ended):
+            final[index] = last[index]
+        return {
+            "final_obs": final,
+            "_final_obs": ended,
+            "final_info": self._infos(moved, ended),
+            "_final_info": ended.copy(),
+        }
 
     def render(self) -> tuple[np.ndarray, ...] | None:
         """A picture [480, 480, 3] of each environment, or None without a render mode.
@@ -235,3 +283,16 @@ class HoverVectorEnv(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarr
             "termination": self._names[np.where(which, moved.cause, -1)],
             "_termination": which.copy(),
         }
+
+
+def _read_mode(mode: object) -> AutoresetMode:
+    """The mode itself, by its name, or by its value.
+
+    Raises:
+        BadInput: there is no such mode.
+    """
+    for known in AutoresetMode:
+        if mode is known or mode in (known.name, known.value):
+            return known
+    allowed = ", ".join(known.name for known in AutoresetMode)
+    raise BadInput(f"autoreset_mode: {mode!r} is not allowed. Allowed: {allowed}.")

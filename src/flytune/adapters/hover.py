@@ -1,15 +1,19 @@
-"""The parts that flytune's two Gymnasium environments share: task, spaces, checks of arguments, and pictures."""
+"""The parts that flytune's environments share (Gymnasium's and Stable-Baselines3's): task, spaces, starts, pictures."""
 
+import dataclasses
 from collections import deque
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 
 from flytune.errors import BadInput, require
-from flytune.physics.dynamics import CONTROL_PERIOD
-from flytune.simulation.host import HostEnvironment
-from flytune.simulation.simulator import VehicleStates
+from flytune.physics.dynamics import CONTROL_PERIOD, hovering
+from flytune.physics.rotation import from_euler
+from flytune.simulation.host import HostEnvironment, episodes_at
+from flytune.simulation.simulator import VehicleStates, state_numbers
 from flytune.task.agreement import check_starts
 from flytune.task.files import load_task
 from flytune.task.observation import SIZE
@@ -25,12 +29,19 @@ TRAIL = 300  # steps of the way behind a vehicle that a picture shows
 FARTHEST = 1000.0  # m, also rad: of a start given by hand
 
 
-def read_task(task: str | Path | Task, edits: dict[str, Any] | None) -> Task:
-    """The task by preset name or file, edited, or the Task itself.
+def read_task(task: str | Path | Task, edits: dict[str, Any] | None, max_episode_steps: Any = None) -> Task:
+    """The task by preset name or file, edited, or the Task itself; its horizon is at most `max_episode_steps`.
 
     Raises:
         BadInput: no such task, edits of a Task, or a task whose episodes end as they begin.
     """
+    if max_episode_steps is not None:
+        if not isinstance(max_episode_steps, int | np.integer) or max_episode_steps < 1:
+            raise BadInput(
+                f"max_episode_steps: {max_episode_steps!r} is not allowed. Allowed: a whole number, 1 or more."
+            )
+        whole = read_task(task, edits)
+        return dataclasses.replace(whole, horizon=min(int(whole.horizon), int(max_episode_steps)))
     if isinstance(task, Task) and edits:
         raise BadInput(
             "edits: a Task cannot be edited here. Allowed: edits of a preset or a file. Edit the Task itself."
@@ -41,9 +52,12 @@ def read_task(task: str | Path | Task, edits: dict[str, Any] | None) -> Task:
 
 
 def make_spaces() -> tuple[gymnasium.spaces.Box, gymnasium.spaces.Box]:
-    """The spaces of one observation and one action."""
-    largest = float(np.finfo(np.float32).max)  # infinite bounds would mean the same, but `check_env` warns of them
-    observation = gymnasium.spaces.Box(-largest, largest, (SIZE,), np.float32)
+    """The spaces of one observation and one action, the same in every environment.
+
+    The observation is unbounded, as in Gymnasium's own robots and in gym-pybullet-drones: a finite box would have to
+    depend on the task, and a model of one task could not be loaded for another.
+    """
+    observation = gymnasium.spaces.Box(-np.inf, np.inf, (SIZE,), np.float32)
     return observation, gymnasium.spaces.Box(-1.0, 1.0, (4,), np.float32)
 
 
@@ -64,37 +78,66 @@ def read_action(action: Any, shape: tuple[int, ...]) -> np.ndarray:
     return numbers
 
 
-def read_start(options: dict[str, Any] | None) -> dict[str, Any] | None:
-    """The start in the options of `reset`, None where they have none.
+def read_starts(options: dict[str, Any] | None, number: int) -> tuple[np.ndarray, np.ndarray] | None:
+    """The starts in the options of `reset`, None where they have none: positions [N, 3] in m, and yaws [N] in rad.
+
+    One start serves all N environments; `position` may also be [N, 3], and `yaw` [N].
 
     Raises:
-        BadInput: an unknown option or an impossible start.
+        BadInput: an impossible start.
     """
-    if not options:
+    if not options or not {"position", "yaw"} & set(options):
         return None
-    _refuse_unknown(options, ("position", "yaw"))
     if "position" not in options:
         raise BadInput("options.position: is missing. Allowed: [x, y, z] in metres, beside yaw.")
+    read = []
     for name, shape, allowed in (("position", (3,), "three numbers"), ("yaw", (), "one number")):
         given = options.get(name, 0.0)
         try:
             numbers = np.asarray(given, float)
         except (TypeError, ValueError):
             numbers = np.array(np.nan)
-        if numbers.shape != shape or not (np.abs(numbers) <= FARTHEST).all():
-            raise BadInput(f"options.{name}: {given!r} is not allowed. Allowed: {allowed} within {FARTHEST}.")
-    return {"position": options["position"], "yaw": options.get("yaw", 0.0)}
+        if numbers.shape not in (shape, (number, *shape)) or not (np.abs(numbers) <= FARTHEST).all():
+            each = f", or {number} times as many" if number > 1 else ""
+            raise BadInput(f"options.{name}: {given!r} is not allowed. Allowed: {allowed}{each} within {FARTHEST}.")
+        read.append(np.broadcast_to(numbers, (number, *shape)))
+    return read[0], read[1]
+
+
+def start_at(
+    environment: HostEnvironment,
+    starts: tuple[np.ndarray, np.ndarray],
+    noise: Any = None,
+    which: np.ndarray | None = None,
+) -> np.ndarray:
+    """The observations [N, 17] after new episodes that begin at given positions and yaws, level and at rest.
+
+    Args:
+        environment: of N episodes.
+        starts: positions [N, 3] in m, and yaws [N] in rad.
+        noise: 13 standard normal numbers for each observation, [13, N]; drawn by the environment where None.
+        which: the mask [N] of those that begin anew, all where None.
+    """
+    episodes = episodes_at(environment.task, _states_at(environment.task, *map(np.float32, starts)))
+    return environment.start(episodes, noise, which)
+
+
+@jax.jit
+def _states_at(task: Task, positions: Any, yaws: Any) -> Any:
+    def one(position: Any, yaw: Any) -> Any:
+        return state_numbers(hovering(task.vehicle, tuple(position), from_euler(0.0 * yaw, 0.0 * yaw, yaw)))
+
+    return jax.vmap(one, out_axes=-1)(positions, jnp.asarray(yaws))
 
 
 def read_mask(options: dict[str, Any] | None, number: int) -> np.ndarray | None:
     """The mask in the options of a vector environment's `reset`, None for all environments.
 
     Raises:
-        BadInput: an unknown option, or a mask that is none.
+        BadInput: a mask that is none.
     """
-    if not options:
+    if not options or "reset_mask" not in options:
         return None
-    _refuse_unknown(options, ("reset_mask",))
     mask = np.asarray(options["reset_mask"])
     if mask.shape != (number,) or mask.dtype != np.bool_ or not mask.any():
         raise BadInput(
@@ -104,8 +147,13 @@ def read_mask(options: dict[str, Any] | None, number: int) -> np.ndarray | None:
     return mask
 
 
-def _refuse_unknown(options: dict[str, Any], known: tuple[str, ...]) -> None:
-    for name in options:
+def refuse_unknown(options: dict[str, Any] | None, *known: str) -> None:
+    """Refuse options of `reset` that are not known.
+
+    Raises:
+        BadInput: an unknown option.
+    """
+    for name in options or {}:
         if name not in known:
             raise BadInput(f"options.{name}: is unknown. Allowed: {', '.join(known)}.")
 

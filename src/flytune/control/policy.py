@@ -78,6 +78,7 @@ class Policy:
     dials: dict[str, Dial] = dataclasses.field(default_factory=dict)  # empty for a policy with one response
     inputs: dict[str, Input] = dataclasses.field(default_factory=dict)  # of the actor, behind the observation
     setting: dict[str, Any] = dataclasses.field(default_factory=dict)  # dial -> its value
+    bounds: Float[Array, "2 17"] | None = None  # lowest and highest of the observation, beyond which it is clipped
     about: dict[str, Any] = label(default_factory=dict)  # task, vehicle, trainer: in the header of the file
     maps: dict[str, Any] = label(default_factory=dict)  # dial -> its measured response, see control/response_map.py
 
@@ -86,7 +87,8 @@ class Policy:
     ) -> Float[Array, "*batch 4"]:
         """The action in [-1, 1] for one observation or a batch of them, at a setting; its own where None."""
         observation = limited(observation, self.error_limit)
-        scaled = observation * self.input_scale
+        clipped = observation if self.bounds is None else jnp.clip(observation, *self.bounds)
+        scaled = clipped * self.input_scale
         if self.inputs:  # these are not scaled
             further = told(self.inputs, observation, self.setting if setting is None else setting)[..., SIZE:]
             scaled = jnp.concatenate([scaled, further], axis=-1)
@@ -152,6 +154,8 @@ def save_policy(path: Path, policy: Policy) -> None:
         BadInput: the file cannot be written.
     """
     tensors = {"input_scale": np.asarray(policy.input_scale)}
+    if policy.bounds is not None:
+        tensors["bounds"] = np.asarray(policy.bounds)
     for part, layers in (("weight", policy.actor.weights), ("bias", policy.actor.biases)):
         tensors |= {f"actor.{index}.{part}": np.asarray(layer) for index, layer in enumerate(layers)}
     header = {"format": FORMAT, "squash": policy.squash, **CONVENTIONS, "about": policy.about}
@@ -199,6 +203,7 @@ def load_policy(path: Path) -> Policy:
 
 
 def _assemble(path: Path, header: dict[str, Any], tensors: dict[str, np.ndarray]) -> Policy:
+    bounds = tensors.pop("bounds", None)
     layers = (len(tensors) - 1) // 2
     names = {"input_scale", *(f"actor.{i}.{part}" for i in range(layers) for part in ("weight", "bias"))}
     if layers < 1 or set(tensors) != names or header.get("squash") not in ("clip", "tanh"):
@@ -216,6 +221,8 @@ def _assemble(path: Path, header: dict[str, Any], tensors: dict[str, np.ndarray]
         width = weight.shape[1]
     if width != 4 or tensors["input_scale"].shape != (SIZE,):
         raise BadInput(f"{path}: maps {tensors['input_scale'].shape} to {width}, allowed: 17 to 4. Train it again.")
+    if bounds is not None and (bounds.shape != (2, SIZE) or not np.all(bounds[0] <= bounds[1])):
+        raise BadInput(f"{path}: its bounds are damaged. Train it again.")
     for name, tensor in tensors.items():
         if not np.all(np.isfinite(tensor)):
             raise BadInput(f"{path}: {name} holds numbers that are not finite. Train it again.")
@@ -227,6 +234,7 @@ def _assemble(path: Path, header: dict[str, Any], tensors: dict[str, np.ndarray]
         dials=dials,
         inputs=inputs,
         setting=setting,
+        bounds=None if bounds is None else jnp.asarray(bounds),
         about=header.get("about", {}),
         maps=header.get("maps", {}),
     )

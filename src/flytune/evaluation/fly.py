@@ -188,7 +188,7 @@ def rollout_trials(
     record, given, finite = _rollout_on_device(simulator.physics, controller, task, starts, noise_keys, steps)
     if not np.all(finite):
         trial, step = np.argwhere(~np.asarray(finite).T)[0]
-        raise _not_finite(name, given[step, trial], trial, step)
+        raise _not_finite(controller, name, given[step, trial], trial, step)
     return record
 
 
@@ -207,7 +207,7 @@ def _rollout_on_host(
         memory, action, given, finite = _decide(controller, memory, seen)
         if not np.all(finite):
             trial = int(np.argmin(finite))
-            raise _not_finite(name, given[trial], trial, index)
+            raise _not_finite(controller, name, given[trial], trial, index)
         moved = environment.step(np.asarray(action), _noise(noise_keys, index + 1))
         seen, crashed = environment.observation, moved.crashed
         states.append(environment.states.T)
@@ -332,7 +332,9 @@ def _decide(controller: Any, memory: Any, seen: jax.Array) -> tuple[Any, jax.Arr
     return memory, jnp.clip(given, -1.0, 1.0), given, finite
 
 
-def _not_finite(name: str, action: Any, trial: int | np.integer, step: int | np.integer) -> Diverged:
+def _not_finite(controller: Any, name: str, action: Any, trial: int | np.integer, step: int | np.integer) -> Diverged:
+    if failure := getattr(controller, "failure", None):  # of an ONNX model that was stopped in flight
+        return Diverged(f"{name or 'controller'}: {failure}")
     return Diverged(
         f"{name or 'controller'}: action {action} is not finite in trial {trial} "
         f"at {step * CONTROL_PERIOD:.2f} s, on a finite observation."

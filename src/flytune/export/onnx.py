@@ -62,7 +62,8 @@ def rounding_bound(policy: Policy, observations: Float[np.ndarray, "batch 17"]) 
     Source: Higham 2002, Accuracy and Stability of Numerical Algorithms, section 3.1; the mean value theorem.
     """
     seen = np.asarray(limited(jnp.asarray(observations), policy.error_limit))
-    x = seen.astype(float) * np.asarray(policy.input_scale, float)
+    clipped = seen if policy.bounds is None else np.clip(seen, *np.asarray(policy.bounds))
+    x = clipped.astype(float) * np.asarray(policy.input_scale, float)
     error = np.where(seen == observations, UNIT_ROUNDOFF, LIMIT_ERROR) * np.abs(x)
     if policy.inputs:
         further = np.asarray(told(policy.inputs, jnp.asarray(seen), policy.setting), float)[:, SIZE:]
@@ -124,8 +125,11 @@ def _model(policy: Policy) -> Any:
         nodes.append(helper.make_node(operator, inputs, [output], name=output, **attributes))
         return output
 
-    seen = _limited(policy, node, weight) if math.isfinite(policy.error_limit) else INPUT
-    value = node("Mul", seen, weight("input_scale", policy.input_scale), output="scaled")
+    value = seen = _limited(policy, node, weight) if math.isfinite(policy.error_limit) else INPUT
+    if policy.bounds is not None:
+        value = node("Max", value, weight("lowest", policy.bounds[0]), output="above")
+        value = node("Min", value, weight("highest", policy.bounds[1]), output="within")
+    value = node("Mul", value, weight("input_scale", policy.input_scale), output="scaled")
     if policy.inputs:
         value = node("Concat", value, *_further_inputs(policy, seen, node, weight), output="inputs", axis=1)
     last = len(policy.actor.weights) - 1

@@ -25,6 +25,7 @@ from flytune.task.files import load_task, read_task_text, write_task
 from flytune.task.task import Task
 
 SETTLING_TIME = "settling_time"
+SCALED = ".zip@vecnormalize="  # between a model and the file of statistics that scaled its observations
 READERS = {".safetensors": load_policy, ".onnx": load_onnx, ".zip": load_sb3}
 KINDS = f"a run directory, a policy file ({', '.join(READERS)}), {', '.join(CLASSICAL)}"
 
@@ -97,7 +98,8 @@ def find_controller(name: str, task: str | Task | None = None) -> FoundControlle
 
     A policy file is one of flytune, ONNX or a Stable-Baselines3 model `model.zip`; classical controllers are `pid`,
     `geometric` and `lqr` (gains tuned by search; `pid@textbook` for those of the books). A policy with dials may be
-    followed by a setting, as in `dial@speed=0.5` or `dial@settling_time=4`. `task` is the task to fly, a preset, a TOML
+    followed by a setting, as in `dial@speed=0.5` or `dial@settling_time=4`, and a Stable-Baselines3 model by the file
+    of its statistics, as in `model.zip@vecnormalize=vecnormalize.pkl`. `task` is the task to fly, a preset, a TOML
     file or a task; where None, that of the controller's training, or the baseline.
 
     Raises:
@@ -107,6 +109,10 @@ def find_controller(name: str, task: str | Task | None = None) -> FoundControlle
     base, setting = split_setting(name)
     if setting:
         return find_controller(base, wanted).with_dial(setting, name)
+    if SCALED in name and not os.path.exists(name):
+        model, _, statistics = name.partition(SCALED)
+        given = statistics if statistics == "none" else Path(statistics)
+        return _from_file(name, Path(f"{model}.zip"), wanted, statistics=given)
     path = Path(name)
     if os.path.isdir(name):  # unlike Path.is_dir, also where the name is too long to be one
         return _from_run(name, path, wanted)
@@ -155,13 +161,13 @@ def _by_settling_time(name: str, controller: Any, wanted: Any, given: Schedule) 
 def split_setting(name: str) -> tuple[str, dict[str, Any]]:
     """The name of a controller and the setting of its dials, from a name such as `dial@speed=0.5`."""
     base, at, setting = name.rpartition("@")
-    if not at or "=" not in setting or os.path.exists(name):
+    if not at or "=" not in setting or SCALED in name or os.path.exists(name):
         return name, {}
     return base, dict(map(document.parse_assignment, re.split(r",(?=[^,\]]*=)", setting)))
 
 
-def _from_file(name: str, path: Path, wanted: Task | None) -> FoundController:
-    policy = READERS.get(path.suffix, load_policy)(path)
+def _from_file(name: str, path: Path, wanted: Task | None, **given: Any) -> FoundController:
+    policy = READERS.get(path.suffix, load_policy)(path, **given)
     about = {key: str(value) for key, value in policy.about.items() if key != "task_toml"}
     text = policy.about.get("task_toml")
     task = wanted or (read_task_text(text, name) if text else load_task("baseline"))

@@ -139,9 +139,15 @@ class HostEnvironment:
         self.key, episodes, report = _draw(self._structure, self.number, self._numbers, self.key)
         return self._take(episodes, np.array(report), which)
 
-    def start(self, episodes: Any, noise: Noise) -> np.ndarray:
-        """The observation [N, 17] of given episodes [K, N], see `draw_episodes` and `episodes_at`."""
-        return self._take(episodes, np.array(_look(self._structure, self._numbers, episodes, noise)), None)
+    def start(self, episodes: Any, noise: Noise | None = None, which: np.ndarray | None = None) -> np.ndarray:
+        """The observation [N, 17] after given episodes [K, N] of those in the mask `which` [N], all where None.
+
+        `draw_episodes` and `episodes_at` make episodes. The noise is as in `step`.
+        """
+        if noise is None:
+            self.key, key = jax.random.split(self.key)
+            noise = jax.random.normal(key, (NOISY, self.number))
+        return self._take(episodes, np.array(_look(self._structure, self._numbers, episodes, noise)), which)
 
     def _take(self, episodes: Any, report: np.ndarray, which: np.ndarray | None) -> np.ndarray:
         seen, states = report[:SIZE].T.copy(), report[SIZE:].T.copy()
@@ -179,6 +185,23 @@ class HostEnvironment:
             if self._ending == "hold":
                 self._parked = over
         return transition
+
+    def __getstate__(self) -> dict[str, Any]:
+        """What a copy, or another process, needs to go on exactly."""
+        if self.simulator.physics is None:
+            raise BadInput(
+                f"{type(self.simulator).__name__}: its vehicles cannot be copied or pickled. Allowed: the simulator "
+                "flytune. Make another environment, and reset it with the same seed."
+            )
+        state = {name: value for name, value in self.__dict__.items() if name != "_structure"}
+        key = None if self.key is None else np.asarray(jax.random.key_data(self.key))
+        return state | {"key": key, "episodes": np.asarray(self.episodes), "_numbers": np.asarray(self._numbers)}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Go on with what `__getstate__` gave."""
+        self.__dict__ |= state
+        self._structure = jax.tree.structure(self.task)
+        self.key = None if self.key is None else jax.random.wrap_key_data(jnp.asarray(self.key))
 
     def steps(self) -> np.ndarray:
         """How many steps old each episode is, [N] int."""

@@ -4,7 +4,7 @@ import dataclasses
 import hashlib
 import os
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -14,18 +14,9 @@ from jaxtyping import Array, Float
 from flytune.config.pytree import label, pytree, static
 from flytune.control.policy import CONVENTIONS
 from flytune.errors import BadInput, require
-from flytune.export.untrusted.onnx_inspection import (
-    DIAL_INPUT,
-    DIALS,
-    FORMAT,
-    INPUT,
-    OUTPUT,
-    VERSION,
-    first_line,
-    inspect,
-    metadata,
-    read_dials,
-)
+from flytune.export.untrusted.onnx_inspection import DIALS, FORMAT, VERSION, inspect, metadata, read_dials
+from flytune.export.untrusted.onnx_shapes import Ports, find_ports
+from flytune.export.untrusted.sandbox import LOAD_TIME, SANDBOX, STEP_TIME, Stopped
 from flytune.task.dial import Dial, Setting, checked_setting
 from flytune.task.observation import SIZE
 
@@ -38,26 +29,65 @@ BATCH_TOLERANCE = 1e-3
 
 
 class Session:
-    """A model loaded in onnxruntime; two sessions of the same content are equal, so they share a compiled program."""
+    """A model that is ready to run; two sessions of the same content are equal, so they share a compiled program.
 
-    def __init__(self, content: bytes) -> None:
-        onnxruntime = require("onnxruntime", "onnx")
-        options = onnxruntime.SessionOptions()
-        # a network this small needs microseconds, and a single thread repeats its sums bit by bit
-        options.intra_op_num_threads = options.inter_op_num_threads = 1
-        options.log_severity_level = 4  # log nothing: every failure is also an exception
-        options.add_session_config_entry("session.load_model_format", "ONNX")
-        self._session = onnxruntime.InferenceSession(content, options, providers=["CPUExecutionProvider"])
-        self._digest = hashlib.sha256(content).digest()
+    Raises:
+        BadInput: it is damaged, or onnxruntime cannot run it; the message says what, without the name of the file.
+    """
+
+    _stopped: ClassVar[dict[str, str]] = {}  # digest -> why that model was stopped; it is not asked again
+
+    def __init__(self, content: bytes, ports: Ports) -> None:
+        self._content, self._ports = content, ports
+        self._digest = hashlib.sha256(content).hexdigest()
+        self._stopped.pop(self._digest, None)
+        self._load()
+
+    @property
+    def failure(self) -> str | None:
+        """Why the model was stopped, None where it was not."""
+        return self._stopped.get(self._digest)
+
+    def _load(self) -> None:
+        try:
+            answer, _ = SANDBOX.ask({"do": "load", "key": self._digest}, self._content, LOAD_TIME)
+        except Stopped as stopped:
+            raise BadInput(f"{stopped} while it is loaded. Give a smaller network.") from None
+        if problem := answer.get("problem"):
+            raise BadInput(problem)
 
     def __call__(
         self, observations: Float[np.ndarray, "batch 17"], dial: Float[np.ndarray, "_ dials"] | None = None
     ) -> Float[np.ndarray, "batch 4"]:
-        """The actions for a batch of observations, at the setting of each, or at one setting of the dials for all."""
-        given = {INPUT: np.ascontiguousarray(observations, np.float32)}
-        if dial is not None and dial.shape[-1]:
-            given[DIAL_INPUT] = np.ascontiguousarray(np.broadcast_to(dial, (len(observations), dial.shape[-1])))
-        return self._session.run([OUTPUT], given)[0]
+        """The actions for a batch of observations, at the setting of each, or at one setting of the dials for all.
+
+        Raises:
+            BadInput: it was stopped, or cannot be run on these observations.
+        """
+        rows, inputs, parts = len(observations), [], []
+        values = [observations] if dial is None else [observations, dial]
+        for port, numbers in zip(self._ports.inputs, values, strict=False):  # a model without dials ignores them
+            given = np.asarray(np.broadcast_to(numbers, (rows, numbers.shape[-1])), port.type)
+            inputs.append((port.name, port.type, [rows, *(given.shape[1:] if port.bare else port.row)]))
+            parts.append(given.tobytes())
+        request = {"do": "run", "key": self._digest, "inputs": inputs, "output": self._ports.output, "rows": rows}
+        request |= {"batch": self._ports.batch, "whole": {port.name: port.whole for port in self._ports.inputs}}
+        answer, content = self._ask(request, b"".join(parts))
+        if "forgotten" in answer:  # the process was started anew, or has met many models since
+            self._load()
+            answer, content = self._ask(request, b"".join(parts))
+        if problem := answer.get("problem"):
+            self._stopped[self._digest] = problem
+            raise BadInput(problem)
+        return np.frombuffer(content, np.float32).reshape(answer["shape"])
+
+    def _ask(self, request: dict[str, Any], content: bytes) -> tuple[dict[str, Any], bytes]:
+        if self.failure is None:
+            try:
+                return SANDBOX.ask(request, content, STEP_TIME)
+            except Stopped as stopped:
+                self._stopped[self._digest] = f"{stopped} for the actions of one time step. Give a smaller network."
+        raise BadInput(self.failure)
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, Session) and self._digest == other._digest
@@ -109,17 +139,22 @@ class OnnxController:
         settings = dials.reshape(-1, dials.shape[-1]) if dials.size else None
         try:
             return np.clip(self.session(rows, settings), -1.0, 1.0).reshape(shape)
-        except Exception:  # the probe did not cause it; `fly` reports where and when an action is not finite
+        except Exception:  # the probe did not cause it; `fly` reports where and when, and `failure` may say why
             return np.full(shape, np.nan, np.float32)
+
+    @property
+    def failure(self) -> str | None:
+        """Why the model was stopped in flight, None where it was not."""
+        return self.session.failure
 
 
 def load_onnx(path: Path) -> OnnxController:
     """A controller from an ONNX file that maps `observation` [batch, 17] to `action` [batch, 4].
 
     Raises:
-        BadInput: the file is missing or damaged, has other inputs, outputs or conventions, contains more than
-            arithmetic, keeps weights in another file, has numbers that are not finite or actions outside [-1, 1]; or
-            the extra `onnx` is not installed.
+        BadInput: the file is missing or damaged, has other inputs, outputs or conventions, contains control flow,
+            randomness or operators outside the standard, keeps weights in another file, has numbers that are not finite
+            or actions outside [-1, 1], or needs too much memory or time; or the extra `onnx` is not installed.
     """
     require("onnx", "onnx")
     require("onnxruntime", "onnx")
@@ -141,16 +176,16 @@ def load_onnx(path: Path) -> OnnxController:
 
 def read_onnx(content: bytes, where: str) -> OnnxController:
     """A controller from the content of an ONNX file, see `load_onnx`; errors begin with `where`, the file's name."""
+    require("onnxruntime", "onnx")
     model = inspect(content, where)
     dials = read_dials(model, where)
     setting = {name: float(dial.default) for name, dial in dials.items()}
+    ports = find_ports(model, len(dials), where)
     try:
-        session = Session(model.SerializeToString())  # only what was inspected
-        _probe(session, np.asarray([list(setting.values())], np.float32), where)
-    except BadInput:
-        raise
-    except Exception as error:  # the exceptions of onnxruntime have no common base
-        raise BadInput(f"{where}: onnxruntime cannot run it ({first_line(error)}). Export it again.") from None
+        session = Session(model.SerializeToString(), ports)  # only what was inspected
+        _probe(session, np.asarray([list(setting.values())], np.float32))
+    except BadInput as error:
+        raise BadInput(f"{where}: {error}") from None
     about = {key: value for key, value in metadata(model).items() if key not in {*CONVENTIONS, DIALS, FORMAT, VERSION}}
     return OnnxController(session=session, dials=dials, setting=setting, about=about)
 
@@ -175,25 +210,21 @@ def sample_observations(number: int) -> Float[np.ndarray, "number 17"]:
     return observations
 
 
-def _probe(session: Session, dial: Float[np.ndarray, "1 dials"], where: str) -> None:
-    """Refuse a model whose actions have another shape, are out of range, or depend on other rows of the batch."""
+def _probe(session: Session, dial: Float[np.ndarray, "1 dials"]) -> None:
+    """Refuse a model whose actions are out of range, or depend on other rows of the batch."""
     observations = sample_observations(PROBES)
     actions = session(observations, dial)
-    if actions.shape != (PROBES, 4):
-        raise BadInput(
-            f"{where}: gives actions of shape {actions.shape} for {PROBES} observations. Allowed: ({PROBES}, 4)."
-        )
     if not np.all(np.isfinite(actions)):
-        raise BadInput(f"{where}: gives an action that is not finite for a finite observation. Train it again.")
+        raise BadInput("gives an action that is not finite for a finite observation. Train it again.")
     if (largest := np.abs(actions).max()) > 1 + BEYOND_BOX:
         raise BadInput(
-            f"{where}: gives actions up to {largest:.3g} in size. Allowed: -1 to 1. "
+            f"gives actions up to {largest:.3g} in size. Allowed: -1 to 1. "
             "Put the squashing (Clip or Tanh) into the model."
         )
     for index in (0, 1, PROBES - 1):
         alone = session(observations[index : index + 1], dial)
-        if alone.shape != (1, 4) or np.abs(alone[0] - actions[index]).max() > BATCH_TOLERANCE:
+        if np.abs(alone[0] - actions[index]).max() > BATCH_TOLERANCE:
             raise BadInput(
-                f"{where}: gives another action for an observation that is alone in its batch. "
+                "gives another action for an observation that is alone in its batch. "
                 "Allowed: each action depends on its own observation only."
             )
