@@ -84,6 +84,17 @@ def test_a_file_that_is_missing_is_named_with_the_file_that_names_it(tmp_path):
     assert refusal(base).startswith(f"{tmp_path / 'gone.toml'}: cannot be read")
 
 
+def test_the_name_of_a_vehicle_file_without_its_ending_gets_a_hint(folder):
+    text = refusal(write(folder / "short.toml", 'based_on = "baseline"\nvehicle = "mine"'))
+    assert text.endswith("Did you mean mine.toml?")
+
+
+def test_rotors_on_the_command_line_need_the_arm_removed():
+    rotors = {"place": [[0.04, 0.0], [0.0, -0.04], [-0.04, 0.0], [0.0, 0.04]], "spin": [-1, 1, -1, 1]}
+    assert refusal("baseline", {"vehicle.rotors": rotors}).endswith('Give one, and "none" for the other.')
+    assert load_task("baseline", {"vehicle.rotors": rotors, "vehicle.arm": "none"}).vehicle.arm is None
+
+
 def test_a_value_of_a_base_that_follows_a_dial_is_refused_too(tmp_path):
     write(tmp_path / "base.toml", 'based_on = "dial"\n[reward.velocity]\nsharpness = 3.0')
     text = refusal(write(tmp_path / "mine.toml", 'based_on = "base.toml"'))

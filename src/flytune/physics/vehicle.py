@@ -1,6 +1,7 @@
 """Vehicles: every constant of a quadrotor, with unit and source, in one TOML file per vehicle."""
 
 import math
+import os
 from importlib import resources
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -119,7 +120,7 @@ class Vehicle:
         if self.arm is None and self.rotors is None:
             return "arm: missing. Allowed: above 0 m, or a table [rotors] with the place and spin of each rotor."
         if self.arm is not None and self.rotors is not None:
-            return "arm: stands beside [rotors], which say where the rotors are. Give one of the two."
+            return 'arm: stands beside [rotors], which say where the rotors are. Give one, and "none" for the other.'
         if text := implausible(self):
             return text
         largest, others = max(self.inertia), sum(self.inertia) - max(self.inertia)
@@ -153,7 +154,8 @@ def vehicle_table(name: str, folder: Path = Path(), where: str = "") -> dict[str
         path = folder / Path(name).expanduser()
         beside = " A path in a file is relative to the folder of that file." if where else ""
         return {"name": path.stem, **document.load(path, f"{where}vehicle: ", f"Give a vehicle's file.{beside}")}
-    hint = document.nearest(name, vehicle_names())
+    file = f"{name}.toml"
+    hint = file if os.path.isfile(folder / file) else document.nearest(name, vehicle_names())
     raise BadInput(
         f"{where}vehicle: {name!r} is no vehicle. Allowed: {', '.join(vehicle_names())}, or a .toml file."
         + (f" Did you mean {hint}?" if hint else "")
