@@ -51,7 +51,7 @@ AIRFRAMES: dict[str, dict[str, Any]] = {
     "lifter": _SHARED | {
         "mass": 25.0, "inertia": [1.2, 1.2, 2.0], "arm": 0.6, "thrust_coefficient": 4.9e-6,
         "torque_coefficient": 1.2e-7, "propeller_radius": 0.37, "maximum_rotor_speed_rpm": 5500.0,
-        "motor_rise_time_constant": 0.2, "motor_fall_time_constant": 0.3, "action_latency_steps": 3,
+        "motor_rise_time_constant": 0.2, "motor_fall_time_constant": 0.3,
         "drag": [1.0, 1.0, 1.5],
     },
 }  # fmt: skip

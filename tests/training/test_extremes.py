@@ -12,7 +12,7 @@ from flytune.errors import BadInput, Diverged
 from flytune.task.files import load_task
 from flytune.training.loop import train
 
-SMALL = SMALL_APG | SMALL_PPO | {"apg.updates": 1, "ppo.steps": 64}
+SMALL = SMALL_APG | SMALL_PPO | {"apg.updates": 2, "ppo.steps": 128}  # two updates, and one program for all
 PARTS = ("target", "initial_state", "noise", "reward", "termination")
 
 
@@ -68,8 +68,7 @@ def test_the_smallest_settings_of_a_trainer_train(trainer, edits):
     ],
 )
 def test_what_a_message_about_numbers_that_diverged_proposes_helps(trainer, edits, remedy, cure):
-    small = SMALL | {"apg.updates": 3, "ppo.steps": 192}
     with pytest.raises(Diverged) as caught:
-        train(load_task("baseline", small | edits), trainer)
+        train(load_task("baseline", SMALL | edits), trainer)
     assert remedy in str(caught.value)
-    train(load_task("baseline", small | edits | cure), trainer)
+    train(load_task("baseline", SMALL | edits | cure), trainer)
