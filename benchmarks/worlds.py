@@ -69,7 +69,7 @@ def equations(
         )
         pull = to_inertial(q[None], np.array([[0, 0, thrust.sum()]]))[0] - drag * v
         if rotors_drag:
-            pull = pull + rotor_drag(q[None], v[None], rpm[None])[0]
+            pull = pull + rotor_drag(vehicle, q[None], v[None], rpm[None])[0]
         twist = np.cross(w, inertia * w) if gyroscopic else 0.0
         turn = 0.5 * np.array([*(q[3] * w + np.cross(q[:3], w)), -q[:3] @ w])
         gravity = np.array([0, 0, vehicle.gravity])

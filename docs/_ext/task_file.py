@@ -15,7 +15,7 @@ from docutils import nodes
 from sphinx.application import Sphinx
 from sphinx.util.docutils import SphinxDirective
 
-from flytune.config.document import allowed
+from flytune.config.fields import allowed, reason
 from flytune.config.formula import Formula
 
 
@@ -96,7 +96,12 @@ def rows(kind: type) -> Iterator[str]:
             values = f"`{get_args(base)[0]}`" if get_origin(base) is Literal else ""
             yield f"| `kind` | | {values} | required | names the class |"
             continue
-        cells = (cell(unit(annotation)), cell(allowed(annotation)), default(field), cell(notes[field.name]))
+        cells = (
+            cell(unit(annotation)),
+            cell(allowed(annotation) + reason(annotation)),
+            default(field),
+            cell(notes[field.name]),
+        )
         yield f"| `{field.name}` | {' | '.join(cells)} |"
 
 

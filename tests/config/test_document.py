@@ -112,7 +112,7 @@ def test_a_yes_or_no_is_written_and_read_back(locked):
 
 
 @settings(max_examples=100)
-@given(st.floats(0, allow_infinity=False, allow_subnormal=True))
+@given(st.just(0.0) | st.floats(1e-30, 1e30))
 def test_every_number_is_written_to_its_last_bit(mass):
     text = document.write(Car(mass=mass, doors=2, centre=(0.0, 0.0, 0.0), wheels={"left": Wheel(radius=0.3)}))
     assert document.read(Car, tomllib.loads(text)).mass == mass
@@ -167,3 +167,22 @@ def test_a_whole_number_will_do_for_a_real_one():
 def test_the_nearest_option_is_named_and_none_where_none_is_near():
     assert document.nearest("wieght", ["weight", "sharpness"]) == "weight"
     assert document.nearest("zzz", ["weight", "sharpness"]) is None
+
+
+@pytest.mark.parametrize("name", ["rotor_directions", "zzz", "kf"])
+def test_nothing_is_named_where_nothing_is_near(name):
+    assert document.nearest(name, ["motor_rise_time_constant", "thrust_coefficient", "maximum_rotor_speed_rpm"]) is None
+
+
+@pytest.mark.parametrize(
+    ("name", "option"),
+    [
+        ("arm_length", "arm"),
+        ("rotor_speed", "maximum_rotor_speed_rpm"),
+        ("thrust_coeff", "thrust_coefficient"),
+        ("motor_time_constant", "motor_rise_time_constant"),
+    ],
+)
+def test_a_name_with_more_or_fewer_words_is_near(name, option):
+    options = ["arm", "motor_rise_time_constant", "thrust_coefficient", "maximum_rotor_speed_rpm", "mass"]
+    assert document.nearest(name, options) == option

@@ -6,6 +6,7 @@ import math
 import numpy as np
 import pytest
 
+from flytune.errors import BadInput
 from flytune.physics.vehicle import load_vehicle
 from flytune.simulation.model_files import urdf
 from flytune.simulation.simulator import VehicleStates
@@ -83,6 +84,16 @@ def test_rotor_drag_slows_a_flight_along_its_way(paper):
     rate = 9.1785e-7 * 4 * paper.hover_rotor_speed_rpm * 2 * math.pi / 60 / paper.mass
     assert end.velocity[0, 0] == pytest.approx(math.exp(-rate), rel=1e-3)
     assert np.abs(end.velocity[0, 1:]).max() < 1e-12
+
+
+@pytest.mark.parametrize("effect", ["rotor_drag", "ground_effect"])
+def test_an_effect_is_refused_for_a_vehicle_that_does_not_say_its_coefficient(paper, effect):
+    other = dataclasses.replace(paper, name="hummingbird", **{effect: None})
+    with pytest.raises(
+        BadInput, match=f"^world pybullet: {effect}=true is not possible, since the vehicle hummingbird"
+    ):
+        make_simulator("pybullet", other, 1, {effect: True})
+    make_simulator("pybullet", other, 1).close()
 
 
 def test_a_world_can_be_closed_twice_and_others_live_on(paper):

@@ -177,15 +177,31 @@ def test_the_lower_propellers_of_a_tilted_vehicle_gain_more_and_those_on_its_bac
     assert not gain[1].any()
 
 
-def test_rotor_drag_opposes_motion_along_the_bodys_axes_and_grows_with_rotor_speed(attitudes):
+def test_rotor_drag_opposes_motion_along_the_bodys_axes_and_grows_with_rotor_speed(paper, attitudes):
     rpm = np.full((20, 4), 15_000.0)
     turning = 4 * 15_000 * 2 * math.pi / 60  # rad/s
     for axis, coefficient in enumerate((9.1785e-7, 9.1785e-7, 10.311e-7)):
         velocity = 0.5 * rotation_matrix(attitudes)[:, :, axis]  # 0.5 m/s along one axis of each body
-        np.testing.assert_allclose(rotor_drag(attitudes, velocity, rpm), -coefficient * turning * velocity, atol=1e-15)
+        np.testing.assert_allclose(
+            rotor_drag(paper, attitudes, velocity, rpm), -coefficient * turning * velocity, atol=1e-15
+        )
     np.testing.assert_allclose(
-        rotor_drag(attitudes, velocity, 2 * rpm), 2 * rotor_drag(attitudes, velocity, rpm), rtol=1e-12
+        rotor_drag(paper, attitudes, velocity, 2 * rpm), 2 * rotor_drag(paper, attitudes, velocity, rpm), rtol=1e-12
     )
+
+
+def test_each_vehicle_has_its_own_air(paper, attitudes):
+    # ten times the coefficients, ten times the force; a vehicle that does not say them has none
+    velocity, rpm = np.tile([1.0, 2.0, 3.0], (20, 1)), np.full((20, 4), 15_000.0)
+    high = np.array([[0.0, 0.0, 1.0]])
+    for factor in (0, 10):
+        other = dataclasses.replace(
+            paper, rotor_drag=tuple(factor * each for each in paper.rotor_drag), ground_effect=factor * 11.36859
+        )
+        force = factor * rotor_drag(paper, attitudes, velocity, rpm)
+        np.testing.assert_allclose(rotor_drag(other, attitudes, velocity, rpm), force, rtol=1e-12, atol=1e-15)
+        gain = factor * ground_effect(paper, high, attitudes[:1])
+        np.testing.assert_allclose(ground_effect(other, high, attitudes[:1]), gain, rtol=1e-12, atol=1e-15)
 
 
 # --- flytune as a world ---

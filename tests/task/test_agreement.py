@@ -11,6 +11,7 @@ from flytune.task.files import load_task, preset_names
 from flytune.task.initial_state import EVALUATION_INITIAL_STATES
 from flytune.training.loop import train
 from flytune.training.trainer import TRAINERS, find_trainer
+from flytune.tuning.tune import tune
 
 TILT = {"kind": "maximum_tilt"}
 
@@ -45,7 +46,7 @@ def test_a_target_anywhere_above_its_altitude_bound_can_be_trained(position, tra
         ({"termination.distance.bound": 0.05}, "termination.distance.bound: 0.05 m ends every episode", "1.6"),
         ({"termination.attitude.bound": 0.02}, "termination.attitude.bound: 0.02 rad ends ", "3.14 rad"),
         # 0.2 rad are 11.5 deg, 0.26 rad are 14.9 deg
-        ({"termination.tilt": TILT | {"bound_deg": 0.26}}, "termination.tilt.bound_deg: 0.26 deg", "in rad, write 14.9"),
+        ({"termination.tilt": TILT | {"bound_deg": 0.26}}, "termination.tilt.bound_deg: 0.26 deg", "rad, write 14.9"),
         ({"termination.altitude.bound": 1.5}, "termination.altitude.bound: 1.5 m is not below the target", "1 m high"),
         ({"target.position": [0.0, 0.0, 0.05]}, "termination.altitude.bound: 0.1 m is not below", "0.05 m high"),
         # g sin(0.2) 0.01 s = 0.02 m/s after the first control period
@@ -87,6 +88,12 @@ def test_a_task_made_in_python_is_refused_too_before_anything_is_written(tasks, 
     with pytest.raises(BadInput, match=r"^termination\.distance\.bound: 0\.01 m ends every episode"):
         train(task, "apg", out=tmp_path / "run")
     assert not (tmp_path / "run").exists()
+
+
+def test_a_tuning_is_refused_too_before_anything_is_written(tmp_path):
+    with pytest.raises(BadInput, match=r"^termination\.altitude\.bound: 0\.1 m is not below the target"):
+        tune(settling_time=3.0, task="baseline", edits={"target.position": [0.0, 0.0, 0.05]}, out=tmp_path / "tuned")
+    assert not (tmp_path / "tuned").exists()
 
 
 def test_all_trainers_check_the_starts():

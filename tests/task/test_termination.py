@@ -44,6 +44,15 @@ def test_a_margin_is_the_share_of_the_bound_that_is_left(name, situation):
         assert condition.margin(situation(**at(share))) == pytest.approx(1 - share, abs=2e-6)
 
 
+@pytest.mark.parametrize("bound", [0.0, -2.0])
+def test_the_margin_of_a_floor_at_zero_or_below_is_the_height_above_it_in_metres(bound, situation):
+    condition = MinimumAltitude(bound=bound)
+    for height in (-0.5, 0.0, 0.3):
+        assert condition.margin(situation(altitude=bound + height)) == pytest.approx(height, abs=1e-6)
+    slope = jax.grad(lambda each, bound: MinimumAltitude(bound=bound).margin(situation(altitude=each)))(1.0, bound)
+    assert slope == pytest.approx(1.0)
+
+
 @pytest.mark.parametrize(
     ("name", "quantity", "limit"),
     [("altitude", "altitude", 0.1), ("distance", "distance", 3.0), ("attitude", "attitude_error", 1.0),

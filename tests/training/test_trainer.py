@@ -89,3 +89,26 @@ def test_a_warm_start_is_refused_by_a_trainer_without_one_and_nothing_is_written
     ):
         train(small_task, trainer, warm_start=policy, out=tmp_path / "run")
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("trainer", "path", "remedy"),
+    [
+        ("apg", "ppo.learning_rate", "which has its settings in apg. Set a field of apg, or give --trainer ppo."),
+        ("ppo", "apg.updates", "which has its settings in ppo. Set a field of ppo, or give --trainer apg."),
+        ("sb3", "apg.updates", "which has its settings in ppo. Set a field of ppo, or give --trainer apg."),
+        ("apg", "initial_state.largest_tilt", "Set apg.initial_state.largest_tilt."),
+        ("apg", "initial_state", "Set apg.initial_state."),
+    ],
+)
+def test_an_edit_that_a_trainer_does_not_read_is_refused(trainer, path, remedy):
+    with pytest.raises(BadInput, match=f"^set: {path} is not read by trainer {trainer}, ") as caught:
+        find_trainer(trainer).check_edits([path])
+    assert str(caught.value).endswith(remedy)
+
+
+@pytest.mark.parametrize("trainer", TRAINERS.values(), ids=TRAINERS)
+def test_an_edit_that_a_trainer_reads_is_accepted(trainer):
+    trainer.check_edits([f"{trainer.settings_field}.hidden", "reward.velocity.weight", "vehicle", "duration"])
+    if not trainer.own_starts:
+        trainer.check_edits(["initial_state.largest_tilt"])

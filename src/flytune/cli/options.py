@@ -107,14 +107,18 @@ FLIGHT_DEFAULTS = FlightOptions()
 
 
 def assignments(texts: Sequence[str]) -> dict[str, Any]:
-    """Path and value of each PATH=VALUE; the last one of a path counts.
+    """Path and value of each PATH=VALUE.
 
     Raises:
-        BadInput: a text that is no assignment.
+        BadInput: a text that is no assignment, or two values of one path.
     """
     from flytune.config.document import parse_assignment
 
-    return dict(map(parse_assignment, texts))
+    values: dict[str, Any] = {}
+    for path, value in map(parse_assignment, texts):
+        if values.setdefault(path, value) != value:
+            raise BadInput(f"{path}: has two values, {values[path]} and {value}. Give one of them.")
+    return values
 
 
 def check_outputs(folder: Path | None, flights: Path | None) -> None:

@@ -41,7 +41,9 @@ def train(
     from flytune.training.loop import train
     from flytune.training.progress import show_progress
 
-    wanted = load_task(task, assignments(edits))
+    changes = assignments(edits)
+    find_trainer(trainer).check_edits(changes)
+    wanted = load_task(task, changes)
     if steps is not None:
         wanted = find_trainer(trainer).with_steps(wanted, steps)
     if resume and out is None:

@@ -20,12 +20,15 @@ from flytune.config.fields import (
     annotations,
     is_union,
     nearest,
+    reason,
+    slip,
     step_into,
     unit_of,
     unit_text,
     unwrap,
     variant_of,
 )
+from flytune.config.nested import LABELS, leaves, look_up
 from flytune.config.writing import plain, source_of, write
 from flytune.errors import BadInput
 
@@ -37,8 +40,13 @@ __all__ = [
 T = TypeVar("T")
 
 
-def load(path: Path) -> dict[str, Any]:
+def load(path: Path, where: str = "", remedy: str = "Give a TOML file or a preset's name.") -> dict[str, Any]:
     """The content of a TOML file.
+
+    Args:
+        path: the file.
+        where: the beginning of a message.
+        remedy: the end of the message about a file that cannot be read.
 
     Raises:
         BadInput: the file is missing, unreadable or not TOML.
@@ -46,10 +54,10 @@ def load(path: Path) -> dict[str, Any]:
     try:
         text = path.read_text(encoding="utf-8")
     except OSError as error:
-        raise BadInput(f"{path}: cannot be read ({error.strerror}). Give a TOML file or a preset's name.") from None
+        raise BadInput(f"{where}{path}: cannot be read ({error.strerror}). {remedy}") from None
     except UnicodeDecodeError:
-        raise BadInput(f"{path}: is not text. Give a TOML file in UTF-8.") from None
-    return parse(text, str(path))
+        raise BadInput(f"{where}{path}: is not text. Give a TOML file in UTF-8.") from None
+    return parse(text, f"{where}{path}")
 
 
 def parse(text: str, where: str) -> dict[str, Any]:
@@ -122,7 +130,7 @@ def _explain(kind: Any, data: Any, error: ValidationError) -> str:
     for index, name in enumerate(place):
         final = index == len(place) - 1
         if final and problem["type"] == "unexpected_keyword_argument":
-            return _unknown_key(annotation, node, path, str(name))
+            return _unknown_key(annotation, node, path, str(name), data)
         is_key = isinstance(node, Mapping) and name in node
         is_index = isinstance(node, list | tuple) and isinstance(name, int) and name < len(node)
         if not (is_key or is_index or (final and problem["type"] == "missing")):
@@ -134,24 +142,59 @@ def _explain(kind: Any, data: Any, error: ValidationError) -> str:
     if problem["type"].startswith("union_tag"):
         known = _kinds(annotation)
         named = node.get("kind") if isinstance(node, Mapping) else None
+        if isinstance(node, Mapping) and "kind" not in node:
+            others = look_up(data, ".".join(path[:-1])) or {}
+            hint = nearest(path[-1], [each for each in others if each != path[-1]])
+            key = list(node) if len(node) == 1 else []
+            meant = f" Did you mean {'.'.join([*path[:-1], hint, *key])}?" if hint else ""
+            return f"{where}: is new here and has no kind.{meant} A new one needs a kind: {', '.join(known)}."
         hint = nearest(str(named), known)
         return f"{where}.kind: {named!r} is none of: {', '.join(known)}." + (f" Did you mean {hint}?" if hint else "")
     is_missing = problem["type"] == "missing" and not isinstance(place[-1], int)
     found = "missing" if is_missing else f"{_shown(node)} is not allowed"
-    return f"{where}: {found}. Allowed: {allowed(annotation)}{unit_text(annotation, ' ')}."
+    if problem["type"] == "value_error" and "ctx" in problem:  # of a check of our own, which says why
+        return f"{where}: {found}: {problem['ctx']['error']}."
+    hint = "" if is_missing else slip(annotation, node, functools.partial(_accepts, annotation))
+    return f"{where}: {found}. Allowed: {allowed(annotation)}{unit_text(annotation, ' ')}{reason(annotation)}.{hint}"
 
 
-def _unknown_key(annotation: Any, node: Any, path: list[str], name: str) -> str:
+def _accepts(annotation: Any, value: float) -> bool:
+    """Whether a field of this type accepts a number."""
+    try:
+        _adapter(annotation).validate_python(value)
+    except ValidationError:
+        return False
+    return True
+
+
+def _unknown_key(annotation: Any, node: Any, path: list[str], name: str, data: Any) -> str:
     base, _ = unwrap(annotation)
     if is_union(base):
         base = variant_of(base, node)
     fields = annotations(base) if dataclasses.is_dataclass(base) else {}
     where = ".".join([*path, name])
     hint = nearest(name, list(fields))
+    if hint is None and (others := _elsewhere(data, where, name, node[name])):
+        return f"{where}: no such field. Did you mean {' or '.join(others)}?"
     if hint is None:
         return f"{where}: no such field. Fields here: {', '.join(fields)}."
     now = f"now {_shown(node[hint])}, " if hint in node and not isinstance(node[hint], Mapping) else ""
     return f"{where}: no such field. Did you mean {'.'.join([*path, hint])} ({now}allowed: {allowed(fields[hint])})?"
+
+
+def _elsewhere(data: Any, where: str, name: str, value: Any) -> list[str]:
+    """Up to three paths of existing fields that end as a wrong path does, for instance vehicle.mass for mass."""
+    wanted = [f".{name}.{path}" for path, _ in leaves(value)] if isinstance(value, Mapping) else [f".{name}"]
+    there = [".".join(path) for path in _paths(data) if not f"{'.'.join(path)}.".startswith(f"{where}.")]
+    return [path for path in there if path.endswith(tuple(wanted))][:3]
+
+
+def _paths(data: Any, path: tuple[str, ...] = ()) -> Iterator[tuple[str, ...]]:
+    """The paths of all tables and values, those of labels left out."""
+    for key, value in data.items() if isinstance(data, Mapping) else ():
+        if key not in LABELS:
+            yield (*path, key)
+            yield from _paths(value, (*path, key))
 
 
 def _shown(value: Any) -> str:

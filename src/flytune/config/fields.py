@@ -2,16 +2,27 @@
 
 import dataclasses
 import difflib
+import math
 import types
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
 
 import annotated_types
-from pydantic import AllowInfNan, Strict
+from pydantic import AfterValidator, AllowInfNan, Strict
 
 from flytune.config.formula import Formula
 
-Real = Annotated[float, Strict(), AllowInfNan(False)]
+LARGEST, SMALLEST = 1e30, 1e-30  # what squares and quotients of single precision still hold, with room
+
+
+def _single(value: float) -> float:
+    """The number, which single precision has to hold."""
+    if value and not SMALLEST <= abs(value) <= LARGEST:
+        raise ValueError(f"numbers are single precision, 0 or {SMALLEST:g} to {LARGEST:g} in size")
+    return value
+
+
+Real = Annotated[float, Strict(), AllowInfNan(False), AfterValidator(_single)]
 Whole = Annotated[int, Strict()]
 Vector = tuple[Real, Real, Real]
 
@@ -58,9 +69,13 @@ def unit_of(kind: Any, data: Mapping[str, Any], path: str) -> str:
 
 
 def nearest(name: str, options: Iterable[str]) -> str | None:
-    """The option spelled most like `name`, or None where nothing is near."""
-    found = difflib.get_close_matches(name, list(options), n=1, cutoff=0.6)
-    return found[0] if found else None
+    """The option spelled most like `name`, or that shares all words of the shorter one; None where nothing is near."""
+    options = list(options)
+    if found := difflib.get_close_matches(name, options, n=1, cutoff=0.75):
+        return found[0]
+    words = set(name.split("_"))
+    shared = [each for each in options if words <= set(each.split("_")) or set(each.split("_")) <= words]
+    return min(shared, key=len, default=None)
 
 
 def unit_text(annotation: Any, before: str = "") -> str:
@@ -71,6 +86,43 @@ def unit_text(annotation: Any, before: str = "") -> str:
     for detail in details:
         if isinstance(detail, annotated_types.Unit) and detail.unit != "1":
             return before + detail.unit
+    return ""
+
+
+def reason(annotation: Any) -> str:
+    """Why a field has its range, in brackets after a space; empty where its type does not say."""
+    base, details = unwrap(annotation)
+    if get_origin(base) is tuple:
+        return reason(get_args(base)[0])
+    return next((f" ({each.documentation})" for each in details if isinstance(each, annotated_types.DocInfo)), "")
+
+
+OTHER_UNITS = {  # unit of a field -> other units that a number may be in by mistake, each with its factor
+    "rad": {"deg": math.pi / 180},
+    "rad/s": {"deg/s": math.pi / 180},
+    "deg": {"rad": 180 / math.pi},
+    "deg/s": {"rad/s": 180 / math.pi},
+    "s": {"ms": 1e-3},
+    "m": {"mm": 1e-3},
+    "m/s^2": {"cm/s^2": 1e-2},
+    "1": {"percent": 1e-2},
+}
+
+
+def slip(annotation: Any, value: Any, accepts: Callable[[float], bool]) -> str:
+    """What a number out of range would be if it were in another unit: a hint after a space, or nothing.
+
+    Args:
+        annotation: of the field.
+        value: that was refused.
+        accepts: whether the field accepts a number.
+    """
+    unit = next((each.unit for each in unwrap(annotation)[1] if isinstance(each, annotated_types.Unit)), "")
+    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value) or not value:
+        return ""
+    for other, factor in OTHER_UNITS.get(unit, {}).items():
+        if accepts(value * factor):
+            return f" Is it in {other}? Then write {value * factor:.4g}."
     return ""
 
 
@@ -92,7 +144,7 @@ def step_into(annotation: Any, name: Any, data: Any) -> Any:
     """The annotation one step further down a path, or None where there is no such field."""
     base, _ = unwrap(annotation)
     if is_union(base):
-        base = variant_of(base, data)
+        base = variant_of(base, data) or next((each for each in get_args(base) if get_origin(each) is tuple), None)
     if dataclasses.is_dataclass(base):
         return annotations(base).get(name)
     if get_origin(base) is dict:

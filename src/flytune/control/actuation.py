@@ -44,7 +44,8 @@ def allocate(vehicle: Vehicle, thrust: Any, torque: Components) -> Components:
     """
     limits = tuple(commanded_rotor_speed(vehicle, jnp.asarray(action)) ** 2 for action in (-1.0, 1.0))
     solve = _x_squares if vehicle.rotors is None else _squares
-    return tuple(jnp.sqrt(square) for square in solve(vehicle, thrust, torque, limits))
+    squares = solve(vehicle, thrust, torque, limits)
+    return tuple(jnp.sqrt(jnp.maximum(square, 0.0)) for square in squares)  # at 0, rounding may leave a negative one
 
 
 def _x_squares(vehicle: Vehicle, thrust: Any, torque: Components, limits: Components) -> Components:

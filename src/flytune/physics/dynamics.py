@@ -42,16 +42,16 @@ def hovering(vehicle: Vehicle, position: Components, attitude: Components = (0.0
 
 
 def commanded_rotor_speed(vehicle: Vehicle, action: Any) -> Any:
-    """The rotor speed in rpm that an action of one motor asks for, within the motor's limit.
+    """The rotor speed in rpm that an action of one motor asks for, within the motor's limits.
 
-        rpm = hover speed * (1 + action_scale * action)
+        rpm = hover speed * (1 + action_scale * action), from 0 to the maximum
 
-    The action is clipped to [-1, 1].
+    The action is clipped to [-1, 1]. With an action_scale above 1 a rotor stands still already before action -1.
 
     Source: paper R9, where action_scale is 1/2.
     """
     wanted = vehicle.hover_rotor_speed_rpm * (1 + vehicle.action_scale * jnp.clip(action, -1.0, 1.0))
-    return jnp.minimum(wanted, vehicle.maximum_rotor_speed_rpm)
+    return jnp.clip(wanted, 0.0, vehicle.maximum_rotor_speed_rpm)
 
 
 def angular_acceleration(vehicle: Vehicle, body_rate: Components, torque: Components) -> Components:

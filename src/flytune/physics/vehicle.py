@@ -1,20 +1,24 @@
 """Vehicles: every constant of a quadrotor, with unit and source, in one TOML file per vehicle."""
 
 import math
+import os
 from importlib import resources
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from annotated_types import Ge, Gt, Le, Unit
+from annotated_types import Ge, Gt, Le, Unit, doc
 
 from flytune.config import document
 from flytune.config.document import Real, Whole
 from flytune.config.pytree import label, pytree, static
 from flytune.errors import BadInput
+from flytune.physics.plausibility import implausible
 
 Place = tuple[Annotated[Real, Unit("m")], Annotated[Real, Unit("m")]]
 Spin = Literal[-1, 1]
+NotNegative = Annotated[Real, Ge(0)]
+MotorLag = Annotated[Real, Ge(0), Le(1), Unit("s"), doc("motors of quadrotors need 0.005 to 0.3 s")]
 
 
 @pytree
@@ -72,11 +76,17 @@ class Vehicle:
         Annotated[Real, Ge(0), Unit("kg/s")],
         Annotated[Real, Ge(0), Unit("kg/s")],
     ]  # linear drag along the inertial axes
-    gravity: Annotated[Real, Gt(0), Unit("m/s^2")]
-    action_scale: Annotated[Real, Gt(0), Le(1), Unit("1")]  # rotor speed = hover speed * (1 + action_scale * action)
+    rotor_drag: Annotated[  # of turning propellers, along the body's axes, per sum of rotor speeds; for PyBullet
+        tuple[NotNegative, NotNegative, NotNegative] | None, Unit("kg/rad")
+    ] = None
+    ground_effect: Annotated[Real | None, Ge(0), Le(100), Unit("1")] = None  # k of the gain k (r / 4 h)^2; for PyBullet
+    gravity: Annotated[Real, Ge(1), Le(30), Unit("m/s^2"), doc("the Moon has 1.6, the Earth 9.8, Jupiter 25")]
+    action_scale: Annotated[  # rotor speed = hover speed * (1 + action_scale * action), never below 0
+        Real, Gt(0), Le(3), Unit("1"), doc("at 3, full action gives 16 times the weight; quadrotors reach 12")
+    ]
     maximum_rotor_speed_rpm: Annotated[Real, Gt(0), Unit("rpm")]
-    motor_rise_time_constant: Annotated[Real, Ge(0), Unit("s")]  # 0: the motor follows at once
-    motor_fall_time_constant: Annotated[Real, Ge(0), Unit("s")]
+    motor_rise_time_constant: MotorLag  # 0: the motor follows at once
+    motor_fall_time_constant: MotorLag
     action_latency_steps: Annotated[Whole, Ge(0), Le(20), Unit("control steps")] = static()
     sources: dict[str, str] = label(default_factory=dict)
 
@@ -110,12 +120,9 @@ class Vehicle:
         if self.arm is None and self.rotors is None:
             return "arm: missing. Allowed: above 0 m, or a table [rotors] with the place and spin of each rotor."
         if self.arm is not None and self.rotors is not None:
-            return "arm: stands beside [rotors], which say where the rotors are. Give one of the two."
-        if self.maximum_rotor_speed_rpm <= self.hover_rotor_speed_rpm:
-            return (
-                f"maximum_rotor_speed_rpm: {self.maximum_rotor_speed_rpm} cannot lift the vehicle. "
-                f"Allowed: above the hover speed, {self.hover_rotor_speed_rpm:.0f} rpm."
-            )
+            return 'arm: stands beside [rotors], which say where the rotors are. Give one, and "none" for the other.'
+        if text := implausible(self):
+            return text
         largest, others = max(self.inertia), sum(self.inertia) - max(self.inertia)
         if largest > others:
             return f"inertia: {list(self.inertia)} is no rigid body's. Allowed: each at most the sum of the other two."
@@ -128,8 +135,13 @@ def vehicle_names() -> list[str]:
     return sorted(entry.name.removesuffix(".toml") for entry in folder.iterdir() if entry.name.endswith(".toml"))
 
 
-def vehicle_table(name: str) -> dict[str, Any]:
+def vehicle_table(name: str, folder: Path = Path(), where: str = "") -> dict[str, Any]:
     """The plain tables of a shipped vehicle, or of a vehicle file.
+
+    Args:
+        name: of the vehicle, or the path of its file.
+        folder: what a relative path starts from.
+        where: the beginning of a message, for instance the file that names the vehicle.
 
     Raises:
         BadInput: neither a shipped vehicle nor a readable file.
@@ -139,11 +151,13 @@ def vehicle_table(name: str) -> dict[str, Any]:
         with resources.as_file(text) as path:
             return {"name": name, **document.load(path)}
     if name.endswith(".toml"):
-        path = Path(name)
-        return {"name": path.stem, **document.load(path)}
-    hint = document.nearest(name, vehicle_names())
+        path = folder / Path(name).expanduser()
+        beside = " A path in a file is relative to the folder of that file." if where else ""
+        return {"name": path.stem, **document.load(path, f"{where}vehicle: ", f"Give a vehicle's file.{beside}")}
+    file = f"{name}.toml"
+    hint = file if os.path.isfile(folder / file) else document.nearest(name, vehicle_names())
     raise BadInput(
-        f"vehicle: {name!r} is no vehicle. Allowed: {', '.join(vehicle_names())}, or a .toml file."
+        f"{where}vehicle: {name!r} is no vehicle. Allowed: {', '.join(vehicle_names())}, or a .toml file."
         + (f" Did you mean {hint}?" if hint else "")
     )
 

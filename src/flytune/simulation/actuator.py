@@ -28,7 +28,7 @@ class Actuator:
     def command(self, action: Float[np.ndarray, "N 4"]) -> None:
         """Accept the actions of a control period; those that the latency has delayed until now move the motors.
 
-            rpm = min(hover speed * (1 + action_scale * clip(action, -1, 1)), maximum)
+            rpm = clip(hover speed * (1 + action_scale * clip(action, -1, 1)), 0, maximum)
 
         Source: paper R9.
         """
@@ -36,7 +36,7 @@ class Actuator:
         now, self._pending = queue[:, 0], queue[:, 1:]
         vehicle = self._vehicle
         wanted = vehicle.hover_rotor_speed_rpm * (1 + vehicle.action_scale * np.clip(now, -1.0, 1.0))
-        self._commanded = np.minimum(wanted, vehicle.maximum_rotor_speed_rpm)
+        self._commanded = np.clip(wanted, 0.0, vehicle.maximum_rotor_speed_rpm)
 
     def turn(self, duration: float) -> Float[np.ndarray, "N 4"]:
         """The rotor speeds in rpm at the middle of the next `duration` seconds, which are simulated.

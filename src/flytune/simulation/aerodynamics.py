@@ -1,4 +1,4 @@
-"""Ground effect and rotor drag of a small quadrotor, as the paper's simulator models them. NumPy, float64."""
+"""Ground effect and rotor drag, as the paper's simulator models them. NumPy, float64."""
 
 import numpy as np
 from jaxtyping import Float
@@ -7,10 +7,9 @@ from flytune.physics.rotors import places
 from flytune.physics.vehicle import Vehicle
 from flytune.simulation.simulator import rotation_matrix, to_body, to_inertial
 
-GROUND_EFFECT_COEFFICIENT = 11.36859  # 1; gym-pybullet-drones (MIT licence), cf2x.urdf: gnd_eff_coeff
 LARGEST_GROUND_EFFECT = 4 / 15  # of the thrust: at gym-pybullet-drones' lowest height, r sqrt(15 k / 4) / 4
-ROTOR_DRAG = np.array([9.1785e-7, 9.1785e-7, 10.311e-7])  # kg/rad; Forster 2015, Crazyflie 2.0, body axes
 RAD_PER_S = 2 * np.pi / 60  # of one rpm
+TINY = 1e-9  # m, where a vehicle without ground effect stands on the floor
 
 
 def ground_effect(
@@ -18,29 +17,35 @@ def ground_effect(
 ) -> Float[np.ndarray, "N 4"]:
     """The share by which each propeller's thrust grows above a floor at z = 0.
 
-        gain = min(4 / 15, k (r / 4 h)^2),  h the height of the propeller, r its radius
+        gain = min(4 / 15, k (r / 4 h)^2),  h the height of the propeller, r its radius, k the vehicle's coefficient
 
     A vehicle upside down has no gain. The floor does not stop a vehicle: below it the gain stays at its largest.
 
-    Source: Panerati et al., Learning to Fly, IROS 2021, after Shi et al., Neural Lander, ICRA 2019; k and the lowest
+    Source: Panerati et al., Learning to Fly, IROS 2021, after Shi et al., Neural Lander, ICRA 2019; the lowest
     height as in gym-pybullet-drones.
     """
+    coefficient = float(vehicle.ground_effect or 0.0)
     upwards = rotation_matrix(attitude)[:, 2]
     height = position[:, 2:] + upwards[:, :2] @ places(vehicle).T
-    lowest = vehicle.propeller_radius / 4 * np.sqrt(GROUND_EFFECT_COEFFICIENT / LARGEST_GROUND_EFFECT)
-    gain = GROUND_EFFECT_COEFFICIENT * (vehicle.propeller_radius / (4 * np.maximum(height, lowest))) ** 2
+    lowest = vehicle.propeller_radius / 4 * np.sqrt(coefficient / LARGEST_GROUND_EFFECT)
+    gain = coefficient * (vehicle.propeller_radius / (4 * np.maximum(height, max(lowest, TINY)))) ** 2
     return np.where(upwards[:, 2:] > 0, gain, 0.0)
 
 
 def rotor_drag(
+    vehicle: Vehicle,
     attitude: Float[np.ndarray, "N 4"],
     velocity: Float[np.ndarray, "N 3"],
     rotor_speed_rpm: Float[np.ndarray, "N 4"],
 ) -> Float[np.ndarray, "N 3"]:
     """The drag of turning propellers in N, inertial frame: -K (sum of rotor speeds) v, K along the body's axes.
 
-    Source: Forster, System Identification of the Crazyflie 2.0 Nano Quadrocopter, ETH Zurich 2015; coefficients as in
-    gym-pybullet-drones' cf2x.urdf, which applies them along the inertial axes instead.
+    K is the vehicle's `rotor_drag` in kg/rad, 0 where it has none.
+
+    Source: Forster, System Identification of the Crazyflie 2.0 Nano Quadrocopter, ETH Zurich 2015.
+    gym-pybullet-drones applies the coefficients along the inertial axes instead.
     """
     turning = RAD_PER_S * rotor_speed_rpm.sum(axis=-1, keepdims=True)
-    return to_inertial(attitude, -ROTOR_DRAG * turning * to_body(attitude, velocity))
+    return to_inertial(
+        attitude, -np.array(vehicle.rotor_drag or (0.0, 0.0, 0.0)) * turning * to_body(attitude, velocity)
+    )

@@ -17,6 +17,7 @@ from flytune.simulation.aerodynamics import ground_effect, rotor_drag
 from flytune.simulation.model_files import urdf
 from flytune.simulation.simulator import VehicleStates, to_body, to_inertial
 
+NEEDED = {"ground_effect": "ground_effect = k", "rotor_drag": "rotor_drag = [x, y, z] in kg/rad; 0 for none"}
 BODY = -1  # PyBullet's index of a vehicle's base link
 
 
@@ -45,8 +46,14 @@ class PyBulletSimulator:
         """An open client with the vehicles in it, all at the origin.
 
         Raises:
-            BadInput: PyBullet is not installed, or too many of its clients are open.
+            BadInput: PyBullet is not installed, too many of its clients are open, or the vehicle lacks a coefficient.
         """
+        for effect in ("ground_effect", "rotor_drag"):
+            if getattr(options, effect) and getattr(vehicle, effect) is None:
+                raise BadInput(
+                    f"world pybullet: {effect}=true is not possible, since the vehicle {vehicle.name} does not say its "
+                    f"{effect}. Give it in the vehicle's file ({NEEDED[effect]}), or leave the option out."
+                )
         self._bullet = require("pybullet", "pybullet")
         self._vehicle, self._options = vehicle, options
         self._period = CONTROL_PERIOD / options.physics_steps
@@ -112,7 +119,7 @@ class PyBulletSimulator:
         body = self.states()
         drag = -self._drag * body.velocity
         if self._options.rotor_drag:
-            drag += rotor_drag(body.attitude, body.velocity, rotor_speed_rpm)
+            drag += rotor_drag(self._vehicle, body.attitude, body.velocity, rotor_speed_rpm)
         for vehicle, force, place in zip(self._vehicles, drag.tolist(), body.position.tolist(), strict=True):
             self._bullet.applyExternalForce(vehicle, BODY, force, place, self._bullet.WORLD_FRAME, self._client)
         if not self._options.ground_effect:

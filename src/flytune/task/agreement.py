@@ -74,7 +74,9 @@ def disagreement(task: Task, initial_state: InitialState, where: str, slack: flo
 def _kept(end: Bounded, starts: Mapping[str, np.ndarray], slack: float) -> np.ndarray:
     """Which starts lie within a bound."""
     limit, values = float(end.limit), starts[end.quantity]
-    return values >= limit - slack * abs(limit) if end.quantity == "altitude" else values <= limit * (1 + slack)
+    if end.quantity == "altitude":
+        return values >= limit - slack * (limit if limit > 0 else 1.0)  # the unit of its margin
+    return values <= limit * (1 + slack)
 
 
 def _quantities(task: Task, initial_state: InitialState) -> dict[str, Float[np.ndarray, "N"]]:

@@ -7,8 +7,11 @@ from pathlib import Path
 from typing import Any
 
 from flytune.config import document, nested
+from flytune.config.fields import annotations
+from flytune.config.removal import NONE, is_named, without_none
 from flytune.errors import BadInput
-from flytune.physics.vehicle import vehicle_table
+from flytune.physics.plausibility import summary
+from flytune.physics.vehicle import Vehicle, vehicle_table
 from flytune.task.following import check_given, settings_to_check
 from flytune.task.task import Task
 
@@ -26,6 +29,7 @@ RENAMED = {
     "ppo.clip_apart": "ppo.separate_grad_clipping",
     "ppo.gradient_norm": "ppo.max_grad_norm",
 }
+NAMED = tuple(name for name, kind in annotations(Task).items() if is_named(kind) and name != "sources")
 
 
 def preset_names() -> list[str]:
@@ -39,8 +43,11 @@ def load_task(task: str | Path, edits: dict[str, Any] | None = None) -> Task:
 
     Args:
         task: a preset (`baseline`, `acrobatic`, `inspection`, or one of them `-refined`), a run directory, or a .toml
-            file, which may say `based_on = "PRESET"` and then only what it changes.
-        edits: field path -> value, for instance {"reward.velocity.weight": 0.08}; `vehicle` also takes a name.
+            file, which may say `based_on = "PRESET"`, or the path of another file, and then only what it changes. Paths
+            in a file are relative to its folder.
+        edits: field path -> value, for instance {"reward.velocity.weight": 0.08}; `vehicle` also takes a name or a
+            file. The value "none" removes a reward term, a termination, a dial, a formula, an input or an optional
+            field.
 
     Raises:
         BadInput: unknown, unreadable, or not a task; one line that names the field.
@@ -51,8 +58,7 @@ def load_task(task: str | Path, edits: dict[str, Any] | None = None) -> Task:
     if name in preset_names():
         data, where = _preset(name), ""
     elif name.endswith(".toml") or os.path.isfile(name):
-        given = document.load(Path(name))
-        data = _on_its_base(_with_sources({"name": Path(name).stem, **given}, name), name)
+        data, given = _from_file(Path(name))
         where = name
     else:
         hint = document.nearest(name, preset_names())
@@ -65,7 +71,7 @@ def load_task(task: str | Path, edits: dict[str, Any] | None = None) -> Task:
     if not edits:
         return task_read
     complete = document.plain(task_read)
-    for path, value in edits.items():
+    for path, value in sorted(edits.items(), key=lambda edit: edit[0].count(".")):  # a table before what is in it
         complete = _edited(complete, path, value)
     return _read(complete)
 
@@ -73,29 +79,111 @@ def load_task(task: str | Path, edits: dict[str, Any] | None = None) -> Task:
 def _preset(name: str) -> dict[str, Any]:
     """The tables of a preset."""
     with resources.as_file(resources.files("flytune.task") / "presets" / f"{name}.toml") as path:
-        return _on_its_base({"name": name, **document.load(path)}, name)
+        data = {"name": name, **document.load(path)}
+    return _laid_over(_preset(data["based_on"]), data, name) if "based_on" in data else data
 
 
-def _on_its_base(data: dict[str, Any], where: str) -> dict[str, Any]:
-    """The tables laid over those of the preset that `based_on` names, so that a file need only say what it changes."""
+def _from_file(path: Path, above: tuple[Path, ...] = ()) -> tuple[dict[str, Any], dict[str, Any]]:
+    """The tables of a task file, laid over those of what it is based on; and what the files themselves say.
+
+    Paths in a file are relative to its folder.
+
+    Args:
+        path: the file.
+        above: the files that are based on it.
+
+    Raises:
+        BadInput: it cannot be read, is based on nothing that exists, or in the end on itself.
+    """
+    if (resolved := path.resolve()) in above:
+        raise BadInput(f"{above[0]}: based_on: leads back to {path}. Base one of these files on a preset.")
+    given = document.load(path)
+    data = _with_sources({"name": path.stem, **given}, str(path))
+    if isinstance(vehicle := data.get("vehicle"), str):
+        data["vehicle"] = vehicle_table(vehicle, path.parent, f"{path}: ")
     if "based_on" not in data:
-        return data
-    changes = {key: value for key, value in data.items() if key != "based_on"}
+        return data, given
     base = data["based_on"]
-    if base not in preset_names():
-        raise BadInput(f"{where}: based_on: {base!r} is no preset. Allowed: {', '.join(preset_names())}.")
-    return nested.overlay(_preset(base), changes)
+    if base in preset_names():
+        below, said = _preset(base), {}
+    elif isinstance(base, str) and base.endswith(".toml"):
+        below, said = _from_file(path.parent / base, (*above, resolved))
+    else:
+        hint = document.nearest(str(base), preset_names())
+        raise BadInput(
+            f"{path}: based_on: {base!r} is no preset. Allowed: {', '.join(preset_names())}, or a .toml file."
+            + (f" Did you mean {hint}?" if hint else "")
+        )
+    return _laid_over(below, data, str(path)), nested.overlay(said, given)
+
+
+def _laid_over(below: dict[str, Any], data: dict[str, Any], where: str) -> dict[str, Any]:
+    """The tables of a file laid over those of its base, so that it need only say what it changes.
+
+    An empty table of named entries, for instance `termination = {}`, removes all of them.
+
+    Raises:
+        BadInput: the file removes what its base does not have.
+    """
+    changes = {key: value for key, value in data.items() if key != "based_on"}
+    for name in NAMED:
+        for key, value in (changes.get(name) or {}).items() if isinstance(changes.get(name), dict) else ():
+            if value == NONE:
+                _check_there(below, (name, key), f"{where}: ")
+        if changes.get(name) == {}:
+            below = {**below, name: {}}
+    if isinstance(vehicle := changes.get("vehicle"), dict) and "vehicle" in below:
+        changes["vehicle"] = _vehicle_over(below["vehicle"], vehicle)
+    if "vehicle" in changes:  # which is laid over already
+        below = {key: value for key, value in below.items() if key != "vehicle"}
+    return nested.overlay(below, changes)
+
+
+def _vehicle_over(below: str | dict[str, Any], vehicle: dict[str, Any]) -> dict[str, Any]:
+    """A vehicle's table laid over that of the base; one that is complete replaces it."""
+    required = {field.name for field in dataclasses.fields(Vehicle) if field.default is field.default_factory}
+    if required <= vehicle.keys():
+        return vehicle
+    base = dict(vehicle_table(below) if isinstance(below, str) else below)
+    for one, other in (("arm", "rotors"), ("rotors", "arm")):
+        if one in vehicle and other not in vehicle:
+            base.pop(other, None)
+    return nested.overlay(base, vehicle)
+
+
+def _check_there(tables: dict[str, Any], path: tuple[str, str], prefix: str = "") -> None:
+    """Refuse to remove a named entry that does not exist.
+
+    Raises:
+        BadInput: there is none; the line names those there are.
+    """
+    table, name = path
+    there = tables.get(table) or {}
+    if name not in there:
+        hint = document.nearest(name, there)
+        raise BadInput(
+            f"{prefix}{table}.{name}: there is none that could be removed. There are: {', '.join(there) or 'none'}."
+            + (f" Did you mean {table}.{hint}?" if hint else "")
+        )
 
 
 def _with_sources(data: dict[str, Any], file: str) -> dict[str, Any]:
-    """The tables of a file that changes a preset; the source of each changed value without one is the file."""
+    """The tables of a file that changes another task; the source of each changed value without one is the file."""
     sources = data.get("sources", {})
     if "based_on" not in data or not isinstance(sources, dict):  # else it is refused, with its name, when it is read
         return data
     changed = {key: value for key, value in data.items() if key not in ("based_on", "vehicle")}
-    paths = (path for path, _ in nested.leaves(changed, skip=nested.LABELS))
+    data = {**data, "sources": _named_sources(changed, sources, file)}
+    vehicle = data.get("vehicle")
+    if isinstance(vehicle, dict) and isinstance(vehicle.get("sources", {}), dict):
+        data["vehicle"] = {**vehicle, "sources": _named_sources(vehicle, vehicle.get("sources", {}), file)}
+    return data
+
+
+def _named_sources(changed: dict[str, Any], sources: dict[str, str], file: str) -> dict[str, str]:
+    paths = (path for path, value in nested.leaves(changed, skip=nested.LABELS) if value != NONE)
     text = f"set in {Path(file).name}"
-    return {**data, "sources": {path: text for path in paths if not document.source_of(path, sources)} | sources}
+    return {path: text for path in paths if not document.source_of(path, sources)} | sources
 
 
 def read_task_text(text: str, where: str) -> Task:
@@ -110,7 +198,8 @@ def read_task_text(text: str, where: str) -> Task:
 def write_task(task: Task) -> str:
     """The TOML text of a task: exact, complete, and with unit, range and source beside each number."""
     sources = dict(task.sources) | {f"vehicle.{path}": text for path, text in task.vehicle.sources.items()}
-    return document.write(task, sources, heading=f"flytune task {task.name}: value  # unit; allowed; source")
+    heading = f"flytune task {task.name}: value  # unit; allowed; source"
+    return document.write(task, sources, heading=f"{heading}\n{task.vehicle.name}: {summary(task.vehicle)}")
 
 
 def _read(data: dict[str, Any], where: str = "") -> Task:
@@ -124,7 +213,20 @@ def _read(data: dict[str, Any], where: str = "") -> Task:
             raise BadInput(f"{f'{where}: ' if where else ''}{old}: is called {new} now. Write {new} instead.")
     vehicle = data.get("vehicle")
     complete = {**data, "vehicle": vehicle_table(vehicle)} if isinstance(vehicle, str) else data
-    return _at_default(document.read(Task, complete, where), where)
+    return _at_default(document.read(Task, _without_removed(complete), where), where)
+
+
+def _without_removed(data: dict[str, Any]) -> dict[str, Any]:
+    """The tables without what is "none", and without the formulas of fields that are gone with it."""
+    kept, follow = without_none(Task, data), data.get("follow")
+    if isinstance(follow, dict):
+        gone = tuple(f"{path}." for path, value in nested.leaves(data, skip=("follow",)) if value == NONE)
+        kept["follow"] = {
+            path: formula
+            for path, formula in follow.items()
+            if formula != NONE and not (gone and path.startswith(gone))
+        }
+    return kept
 
 
 def _edited(data: dict[str, Any], path: str, value: Any) -> dict[str, Any]:
@@ -138,10 +240,15 @@ def _edited(data: dict[str, Any], path: str, value: Any) -> dict[str, Any]:
             f"{' '.join(f'dial.{name}.default=...' for name in data['dial'])}."
         )
     if path.startswith("follow."):  # the path of a field, which is one key
+        if value == NONE:
+            _check_there(data, ("follow", path.removeprefix("follow.")))
         formula = str(value) if isinstance(value, int | float) and not isinstance(value, bool) else value
         return {**data, "follow": {**data.get("follow", {}), path.removeprefix("follow."): formula}}
     if path == "vehicle" and isinstance(value, str):
         return {**data, "vehicle": vehicle_table(value)}
+    table, _, name = path.partition(".")
+    if value == NONE and table in NAMED and name and "." not in name:
+        _check_there(data, (table, name))
     data = nested.edit(data, path, value)
     owner, field = (data["vehicle"], path[len("vehicle.") :]) if path.startswith("vehicle.") else (data, path)
     if not path.startswith(("name", "sources", "vehicle.name", "vehicle.sources")):

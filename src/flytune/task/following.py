@@ -22,7 +22,10 @@ def problem_of_dials(
     if len(dials) > MOST_DIALS:
         return f"dial: {len(dials)} dials are not allowed. Allowed: up to {MOST_DIALS}."
     if not dials and (follow or inputs):
-        return "dial: no dial, though `follow` or `input` needs one. Allowed: one or more tables [dial.NAME]."
+        return (
+            "dial: no dial, though `follow` or `input` needs one. Allowed: one or more tables [dial.NAME]; or "
+            "follow=none and input=none."
+        )
     for name in dials:
         if not name.isidentifier() or name in FUNCTIONS:
             return f"dial.{name}: cannot be used in a formula. Allowed: letters, digits and _, no name of a function."

@@ -14,9 +14,7 @@ from flytune.physics.components import Components
 from flytune.physics.dynamics import State, hovering
 from flytune.physics.rotation import safe_norm
 from flytune.physics.vehicle import Vehicle
-from flytune.task.situation import Target
-
-Metres = Annotated[Real, Ge(-1000), Le(1000), Unit("m")]
+from flytune.task.situation import Metres, Target
 
 
 @pytree

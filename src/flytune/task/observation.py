@@ -6,7 +6,7 @@ from typing import Annotated
 import jax
 import jax.numpy as jnp
 import numpy as np
-from annotated_types import Ge, Unit
+from annotated_types import Ge, Le, Unit, doc
 from jaxtyping import Array, Float
 
 from flytune.config.document import Real
@@ -35,10 +35,12 @@ EARLIER_LAYOUTS = (
 class ObservationNoise:
     """Standard deviations of the Gaussian noise on each block of the observation."""
 
-    position: Annotated[Real, Ge(0), Unit("m")]
-    attitude: Annotated[Real, Ge(0), Unit("1")]  # on each of the four quaternion components
-    velocity: Annotated[Real, Ge(0), Unit("m/s")]
-    body_rate: Annotated[Real, Ge(0), Unit("rad/s")]
+    position: Annotated[Real, Ge(0), Le(10), Unit("m"), doc("farther from its target than 10 m, a flight has crashed")]
+    attitude: Annotated[  # on each of the four quaternion components
+        Real, Ge(0), Le(1), Unit("1"), doc("a component of a unit quaternion is at most 1")
+    ]
+    velocity: Annotated[Real, Ge(0), Le(100), Unit("m/s")]
+    body_rate: Annotated[Real, Ge(0), Le(100), Unit("rad/s")]
 
 
 def observe(

@@ -6,7 +6,7 @@ To add a term: write a class with a `kind`, annotated numbers and `__call__(situ
 from typing import Annotated, Literal
 
 import jax.numpy as jnp
-from annotated_types import Ge, Gt, Le, Unit
+from annotated_types import Ge, Le, Unit
 from jaxtyping import Array, Float
 from pydantic import Field
 
@@ -66,7 +66,7 @@ class Exponential:
     kind: Literal["exponential"] = static(default="exponential")
     of: Error = static()
     weight: Annotated[Real, Ge(0), Unit("1")]
-    sharpness: Annotated[Real, Gt(0), Unit("1/unit(e)^2")]
+    sharpness: Annotated[Real, Ge(0), Unit("1/unit(e)^2")]
 
     def __call__(self, situation: Situation) -> Float[Array, ""]:
         """Reward of one situation, in [0, weight]."""
@@ -88,8 +88,8 @@ class DualExponential:
     of: Error = static()
     weight: Annotated[Real, Ge(0), Unit("1")]
     share: Annotated[Real, Ge(0), Le(1), Unit("1")]
-    wide: Annotated[Real, Gt(0), Unit("1/unit(e)^2")]
-    narrow: Annotated[Real, Gt(0), Unit("1/unit(e)^2")]
+    wide: Annotated[Real, Ge(0), Unit("1/unit(e)^2")]
+    narrow: Annotated[Real, Ge(0), Unit("1/unit(e)^2")]
 
     def __call__(self, situation: Situation) -> Float[Array, ""]:
         """Reward of one situation, in [0, weight]."""

@@ -4,7 +4,7 @@ import math
 from typing import Annotated
 
 import jax.numpy as jnp
-from annotated_types import Unit
+from annotated_types import Ge, Le, Unit, doc
 from jaxtyping import Array, Float
 
 from flytune.config.document import Real
@@ -19,12 +19,17 @@ POSITION_BAND = 0.02
 YAW_BAND = 0.02 * math.pi  # rad; 2 % of 180 deg
 
 
+Metres = Annotated[
+    Real, Ge(-1000), Le(1000), Unit("m"), doc("positions are single precision, coarser than 0.1 mm farther out")
+]
+
+
 @pytree
 class Target:
     """Where to hover: a position and a heading, level and at rest (paper R19: (0, 0, 1) m, zero attitude)."""
 
-    position: tuple[Annotated[Real, Unit("m")], Annotated[Real, Unit("m")], Annotated[Real, Unit("m")]]
-    yaw: Annotated[Real, Unit("rad")]
+    position: tuple[Metres, Metres, Metres]
+    yaw: Annotated[Real, Ge(-2 * math.pi), Le(2 * math.pi), Unit("rad"), doc("a full turn either way")]
 
 
 @pytree

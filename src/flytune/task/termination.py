@@ -11,7 +11,7 @@ import math
 from typing import Annotated, Any, ClassVar, Literal
 
 import jax.numpy as jnp
-from annotated_types import Ge, Gt, Le, Unit
+from annotated_types import Ge, Gt, Le, Unit, doc
 from jaxtyping import Array, Float, Int
 from pydantic import Field
 
@@ -43,15 +43,18 @@ class Bounded:
 
 @pytree
 class MinimumAltitude(Bounded):
-    """Ends an episode that sinks below `bound`. Source: paper R14, 0.1 m."""
+    """Ends an episode that sinks below `bound`, which may be the ground, 0, or below it. Source: paper R14, 0.1 m."""
 
     quantity = "altitude"
     kind: Literal["minimum_altitude"] = static(default="minimum_altitude")
-    bound: Annotated[Real, Gt(0), Unit("m")]
+    bound: Annotated[Real, Ge(-1000), Le(1000), Unit("m")]
 
     def margin(self, situation: Situation) -> Float[Array, ""]:
-        """(z - bound) / bound: zero at the bound, one at twice its height."""
-        return situation.altitude / self.limit - 1
+        """(z - bound) / bound: zero at the bound, one at twice its height; of a bound of 0 or below, z - bound in m."""
+        above = jnp.asarray(self.limit) > 0
+        return jnp.where(
+            above, situation.altitude / jnp.where(above, self.limit, 1.0) - 1, situation.altitude - self.limit
+        )
 
 
 @pytree
@@ -126,7 +129,7 @@ class MaximumBodyRate(Bounded):
 
     quantity, key = "body_rate", "bound_deg_per_s"
     kind: Literal["maximum_body_rate"] = static(default="maximum_body_rate")
-    bound_deg_per_s: Annotated[Real, Gt(0), Unit("deg/s")]
+    bound_deg_per_s: Annotated[Real, Ge(20), Unit("deg/s"), doc("a slower vehicle cannot right itself")]
 
     @property
     def limit(self) -> Any:

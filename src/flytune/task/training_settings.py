@@ -4,7 +4,7 @@ import dataclasses
 import math
 from typing import Annotated, Any, Protocol, runtime_checkable
 
-from annotated_types import Ge, Gt, Le, Lt, Unit
+from annotated_types import Ge, Gt, Le, Lt, Unit, doc
 
 from flytune.config.document import Real, Whole
 from flytune.config.pytree import pytree
@@ -13,6 +13,8 @@ from flytune.task.initial_state import InitialState
 Share = Annotated[Real, Ge(0), Le(1), Unit("1")]
 Positive = Annotated[Real, Gt(0), Unit("1")]
 Count = Annotated[Whole, Ge(1), Le(1_000_000)]
+Layer = Annotated[Whole, Ge(1), Le(4096)]
+MOST_SAMPLES = 2**26  # of an update; each takes some 200 bytes
 
 
 @runtime_checkable
@@ -48,6 +50,17 @@ class TrainerSettings(Protocol):
         ...
 
 
+def _problem_of_samples(name: str, environments: int, steps: int, fewest: int = 2) -> str | None:
+    """What makes the number of samples of an update impossible, or None."""
+    samples = environments * steps
+    if fewest <= samples <= MOST_SAMPLES:
+        return None
+    return (
+        f"{name}: {steps} steps of {environments} environments are {samples} samples per update. "
+        f"Allowed: {fewest} to {MOST_SAMPLES}."
+    )
+
+
 @pytree
 class PpoSettings:
     """Proximal policy optimisation (Schulman et al. 2017), by default the paper's (R16 to R18)."""
@@ -56,10 +69,10 @@ class PpoSettings:
     environments: Count = 128  # reading of R18: 128 x 128 gives the samples of 4 x 4096
     rollout: Annotated[Whole, Ge(1), Le(1_000_000), Unit("steps per environment")] = 128
     epochs: Count = 12  # R17
-    minibatch: Annotated[Whole, Ge(2), Unit("samples")] = 128  # R17
+    minibatch: Annotated[Whole, Ge(2), Unit("samples"), doc("advantages are normalised in each")] = 128  # R17
     learning_rate: Annotated[Real, Gt(0), Unit("1")] = 2e-4  # R17
-    clip_range: Annotated[Real, Gt(0), Lt(1), Unit("1")] = 0.15  # R17
-    discount: Annotated[Real, Gt(0), Le(1), Unit("1")] = 0.99  # R17: Stable-Baselines3
+    clip_range: Annotated[Real, Gt(0), Unit("1")] = 0.15  # R17
+    discount: Annotated[Real, Ge(0), Le(1), Unit("1")] = 0.99  # R17: Stable-Baselines3
     gae_lambda: Share = 0.95
     value_weight: Annotated[Real, Ge(0), Unit("1")] = 0.5
     entropy_weight: Annotated[Real, Ge(0), Unit("1")] = 0.0
@@ -67,13 +80,15 @@ class PpoSettings:
     separate_grad_clipping: bool = False  # max_grad_norm applies to the gradients of actor and critic separately
     final_learning_rate: Share = 1.0  # as a share of the first, reached linearly
     input_scale: tuple[Positive, Positive, Positive, Positive, Positive] = (1.0, 1.0, 1.0, 1.0, 1.0)  # per block of R7
-    initial_log_std: Annotated[Real, Unit("1")] = 0.0
-    hidden: tuple[Count, ...] = (64, 64)  # R16
+    initial_log_std: Annotated[Real, Ge(-20), Le(5), Unit("1")] = 0.0
+    hidden: tuple[Layer, ...] = (64, 64)  # R16
     ema_decay: Annotated[Real, Ge(0), Lt(1), Unit("1 per update")] = 0.95  # share of the old weights in the flown ones
 
     def problem(self) -> str | None:
         """What makes the numbers impossible together, or None."""
         samples = self.environments * self.rollout
+        if text := _problem_of_samples("rollout", self.environments, self.rollout):
+            return text
         if samples % self.minibatch:
             return (
                 f"minibatch: {self.minibatch} does not divide environments * rollout = {samples}. Allowed: a divisor."
@@ -126,8 +141,12 @@ class ApgSettings:
     barrier_margin: Annotated[Real, Ge(0), Lt(1), Unit("1")] = 0.1  # the barrier begins below this margin
     termination_slack: Annotated[Real, Ge(0), Unit("1")] = 0.0  # share of a bound; beyond it by more, an episode ends
     input_scale: tuple[Positive, Positive, Positive, Positive, Positive] = (2.0, 3.0, 2.0, 0.3, 1.0)  # per block of R7
-    hidden: tuple[Count, ...] = (64, 64)
+    hidden: tuple[Layer, ...] = (64, 64)
     ema_decay: Annotated[Real, Ge(0), Lt(1), Unit("1 per update")] = 0.95
+
+    def problem(self) -> str | None:
+        """What makes the numbers impossible together, or None."""
+        return _problem_of_samples("window", self.environments, self.window, fewest=1)
 
     @property
     def steps_per_update(self) -> int:

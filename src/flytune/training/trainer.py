@@ -15,6 +15,8 @@ from flytune.errors import BadInput, require
 from flytune.runs.shipped import DEFAULT_TRAINER as DEFAULT_TRAINER
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable
+
     from jax import Array
 
     from flytune.control.policy import Policy
@@ -38,6 +40,7 @@ class Trainer:
     extra: str = ""  # the extra of flytune that brings `packages`
     packages: tuple[str, ...] = ()  # optional packages that the trainer needs; run.json records their versions
     missing_settings: tuple[str, ...] = ()  # that the trainer lacks, which must therefore have their default values
+    own_starts: bool = False  # whether its settings, not the task, say where training episodes begin
     supports_dials: bool = False  # whether it can train a task with dials
     supports_warm_start: bool = False  # whether a training can start from the weights of a policy
 
@@ -83,9 +86,34 @@ class Trainer:
                     f"{self.settings_field}.{name}: {json.dumps(value)} is not allowed with trainer {self.name}, which "
                     f"has no such setting. Allowed: {json.dumps(default)}. Give this value, or another trainer."
                 )
-        own = getattr(settings, "initial_state", None)  # of a trainer that does not begin where the task does
-        where = "initial_state" if own is None else f"{self.settings_field}.initial_state"
-        check_starts(task, own, where, float(getattr(settings, "termination_slack", 0.0)))
+        if self.own_starts:
+            own: Any = settings
+            check_starts(task, own.initial_state, f"{self.settings_field}.initial_state", float(own.termination_slack))
+        else:
+            check_starts(task)
+
+    def check_edits(self, paths: Iterable[str]) -> None:
+        """Refuse edits of a task that this trainer does not read, so that they would change nothing.
+
+        Raises:
+            BadInput: the path of such an edit, and what the trainer reads instead.
+        """
+        others: dict[str, str] = {}
+        for each in TRAINERS.values():
+            others.setdefault(each.settings_field, each.name)
+        for path in paths:
+            part, _, rest = path.partition(".")
+            if part in others and part != self.settings_field:
+                raise BadInput(
+                    f"set: {path} is not read by trainer {self.name}, which has its settings in {self.settings_field}. "
+                    f"Set a field of {self.settings_field}, or give --trainer {others[part]}."
+                )
+            if part == "initial_state" and self.own_starts:
+                instead = ".".join(filter(None, (self.settings_field, part, rest)))
+                raise BadInput(
+                    f"set: {path} is not read by trainer {self.name}, whose episodes begin in "
+                    f"{self.settings_field}.initial_state. Set {instead}."
+                )
 
     def start(self, task: Task, key: Array) -> Any:
         """The training state before the first update."""
@@ -168,6 +196,7 @@ TRAINERS = {
             summary="analytic policy gradient, through the differentiable simulator",
             module="flytune.training.apg",
             settings_field="apg",
+            own_starts=True,
             supports_dials=True,
             supports_warm_start=True,
         ),

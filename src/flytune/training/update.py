@@ -19,6 +19,7 @@ from flytune.task.task import Task
 from flytune.task.termination import causes
 
 T = TypeVar("T")
+LARGE = 1e4  # per step; rewards and costs of the presets are near 1
 
 
 def network_scale(task: Task, factors: Sequence[float]) -> Float[Array, "inputs"]:
@@ -125,7 +126,33 @@ def metrics_row(task: Task, measured: dict[str, Any], update: int, steps: int, s
     for name, value in row.items():
         if isinstance(value, float) and not math.isfinite(value):
             raise Diverged(
-                f"training: {name} is {value} in update {update} ({steps} environment steps). "
-                "A smaller learning_rate, or smaller weights in the reward, may help."
+                f"training: {name} is {value} in update {update} ({steps} environment steps). {_remedy(row)}"
             )
     return row
+
+
+def _remedy(row: dict[str, Any]) -> str:
+    """What helps where numbers stopped being finite: the cause, as far as the metrics of the update show it."""
+    rewards = row["terms"] | {"": row["reward"]}
+    if not all(math.isfinite(each) for each in rewards.values()):
+        return (
+            "The flight of a vehicle is no longer finite. Tighter bounds in [termination], which end an episode "
+            "before that, help; or a vehicle that turns less within a control step of 0.01 s."
+        )
+    largest = max(row["terms"], key=lambda name: abs(row["terms"][name]))
+    if abs(row["terms"][largest]) > LARGE:
+        return (
+            f"The term reward.{largest} is {row['terms'][largest]:.3g} per step, which is too much for single "
+            f"precision. Give it a smaller weight; the terms of the presets are below 1."
+        )
+    if abs(row.get("objective", 0.0) - row["reward"]) > LARGE:
+        return (
+            f"The barriers cost {row['reward'] - row['objective']:.3g} per step, which is too much for single "
+            "precision. Give a smaller apg.barrier_weight, or smaller values of termination.NAME.barrier."
+        )
+    if row["update"] == 1 and "objective" in row:  # of the analytic policy gradient, taken before the first step
+        return (
+            "Nothing has been learned yet, so that it comes from the task. A smaller apg.window helps, since gradients "
+            "grow with the number of steps; or smaller values of sharpness, wide and narrow in the reward."
+        )
+    return "A smaller learning_rate helps; that of the presets is a start."

@@ -78,7 +78,8 @@ def tune(
     if rules is None or isinstance(rules, str | Path):
         rules = load_rules(rules)
     directory = _directory(out, requirement, resume)
-    find_trainer(trainer, every_task=True)
+    method = find_trainer(trainer, every_task=True)
+    method.check_edits(edits or {})
     if not 1 <= most_iterations <= 100:
         raise BadInput(f"iterations: {most_iterations} is not allowed. Allowed: a whole number, 1 to 100.")
     if not 0 <= seed < 2**32:
@@ -88,6 +89,7 @@ def tune(
         requirement=requirement, rules=rules, out=directory, task=task, edits=dict(edits or {}), seed=seed,
         trainer=trainer, most_iterations=most_iterations, on_message=say, on_progress=on_progress,
     )  # fmt: skip
+    method.check(tuner.start.task)  # before anything is written
     if resume:
         tuner.history.read()
     try:
