@@ -1,7 +1,9 @@
 """`flytune train`."""
 
 import sys
-from typing import Annotated
+from contextlib import AbstractContextManager, nullcontext
+from pathlib import Path
+from typing import Annotated, Any
 
 from cyclopts import Parameter
 
@@ -34,7 +36,6 @@ def train(
     from flytune.control.response_map import ResponseMap
     from flytune.evaluation.evaluate import evaluate, write_evaluation
     from flytune.evaluation.measure_map import with_maps
-    from flytune.runs.directory import new_directory
     from flytune.task.files import load_task
     from flytune.training.loop import train
     from flytune.training.progress import show_progress
@@ -44,8 +45,7 @@ def train(
         wanted = find_trainer(trainer).with_steps(wanted, steps)
     if resume and out is None:
         raise BadInput("resume: needs --out DIR, the run to continue.")
-    out = out or new_directory(f"{wanted.name}-{trainer}-s{seed}")
-    with show_progress() as on_progress:
+    with _directory(out, task, wanted, trainer, seed) as out, show_progress() as on_progress:
         run = train(
             wanted, trainer, seed=seed, out=out, resume=resume, tensorboard=tensorboard, on_progress=on_progress
         )
@@ -59,3 +59,15 @@ def train(
     write_evaluation(out, evaluation.judgement)
     print(evaluation.judgement.line())
     print(out)
+
+
+def _directory(out: Path | None, task: str, wanted: Any, trainer: str, seed: int) -> AbstractContextManager[Path]:
+    """The run directory; a new one under `runs/` is named by task, trainer and seed, and by what was changed."""
+    from flytune.config import document, nested
+    from flytune.runs.naming import new_directory, run_name
+    from flytune.task.files import load_task
+
+    if out is not None:
+        return nullcontext(out)
+    changes = nested.changes(document.plain(load_task(task)), document.plain(wanted))
+    return new_directory(run_name(f"{wanted.name}-{trainer}-s{seed}", changes))

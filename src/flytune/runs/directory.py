@@ -17,21 +17,13 @@ import safetensors
 import safetensors.numpy
 
 from flytune.config import document, nested
-from flytune.config.files import make_folder, write_bytes, write_json, write_text
+from flytune.config.files import RUN_FILES, make_folder, write_bytes, write_json, write_text
 from flytune.control.policy import Policy, save_policy
 from flytune.errors import BadInput
 from flytune.task.files import load_task, write_task
 from flytune.task.task import Task
 
 CHECKPOINT = Path("checkpoint") / "train_state.safetensors"  # in a run directory
-
-
-def new_directory(name: str) -> Path:
-    """A directory under `runs` that does not exist yet: `name`, with a number behind it where that is taken."""
-    path, number = Path("runs") / name, 2
-    while path.exists():
-        path, number = path.with_name(f"{name}-{number}"), number + 1
-    return path
 
 
 class RunDirectory:
@@ -61,6 +53,10 @@ class RunDirectory:
             return
         if holds_run:
             raise BadInput(f"out: {path} already holds a run. Give another directory, or --resume to continue it.")
+        if taken := [name for name in (*RUN_FILES, "checkpoint") if os.path.lexists(path / name)]:
+            raise BadInput(
+                f"out: {path} is no run and holds {taken[0]}, which is not replaced. Give another directory."
+            )
         make_folder(path)
         write_text(path / "task.toml", write_task(task))
         write_json(path / "run.json", _facts(task, trainer, seed, packages))

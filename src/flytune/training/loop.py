@@ -2,6 +2,7 @@
 
 import contextlib
 import dataclasses
+import os
 import signal
 import threading
 import time
@@ -12,6 +13,7 @@ from typing import Any
 
 import jax
 
+from flytune.config.files import held, make_folder
 from flytune.control.policy import Policy
 from flytune.errors import BadInput, Interrupted, require
 from flytune.runs.directory import RunDirectory, resume_command
@@ -85,7 +87,7 @@ def train(
         if out is None:
             raise BadInput("tensorboard: needs out, the run directory to write its event files into.")
 
-    with _deferred_interrupt() as interrupted:
+    with _deferred_interrupt() as interrupted, _held(out, resume):
         directory = RunDirectory(out, task, trainer, seed, resume, method.packages) if out is not None else None
         train_state, rows = method.start(task, jax.random.key(seed)), []
         if warm_start is not None:
@@ -135,6 +137,14 @@ def train(
     if directory is not None:
         directory.finish(run.policy, run.last_policy, rows[-1])
     return run
+
+
+def _held(out: Path | None, resume: bool) -> contextlib.AbstractContextManager[None]:
+    """Holds a run directory, which may be new; what cannot be one is left to `RunDirectory` to refuse."""
+    if out is None or (not os.path.isdir(out) and (resume or os.path.lexists(out))):
+        return contextlib.nullcontext()
+    make_folder(out)
+    return held(out)
 
 
 @contextlib.contextmanager
