@@ -5,15 +5,20 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from flytune.config import document
 from flytune.config.files import make_folder, write_json
+from flytune.config.nested import first_difference
 from flytune.control.controller import Controller
 from flytune.control.schedule import Schedule
 from flytune.evaluation.flights import Flights
 from flytune.evaluation.fly import fly
 from flytune.evaluation.judge import Judgement, judge
 from flytune.runs.find import FoundController, find_controller
+from flytune.runs.naming import run_name
 from flytune.task.files import load_task
 from flytune.task.task import Task
+
+EVALUATION = "evaluation.json"
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
@@ -93,11 +98,19 @@ def _find(
     return found.with_dial(dial) if dial else found
 
 
-def write_evaluation(folder: Path, judgement: Judgement) -> None:
-    """Write `evaluation.json` into a folder, which may be new.
+def write_evaluation(folder: Path, judgement: Judgement, task: Task | None = None) -> Path:
+    """Write `evaluation.json` into a folder, which may be new; returns the file.
+
+    `evaluation.json` of a run directory belongs to the task of the run. Where `task`, which was flown, is another one,
+    the file is `evaluation-TASK.json`.
 
     Raises:
         BadInput: the file cannot be written.
     """
     make_folder(folder)
-    write_json(folder / "evaluation.json", judgement.to_dict())
+    own = folder / "task.toml"
+    name = EVALUATION
+    if task is not None and own.exists() and first_difference(document.plain(load_task(own)), document.plain(task)):
+        name = f"{Path(EVALUATION).stem}-{run_name(task.name, {})}.json"
+    write_json(folder / name, judgement.to_dict())
+    return folder / name

@@ -11,6 +11,8 @@ import numpy as np
 
 from flytune.config.files import write_bytes
 
+MARK = b"target_yaw.npy"  # in every file that `Flights.save` writes, near its end
+
 COLUMNS = {  # per sample: the unit of a field, and the names of its columns in a file
     "position": ("m", "x y z"),
     "attitude": ("1", "qx qy qz qw"),
