@@ -4,7 +4,7 @@ import json
 import os
 import sys
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 from cyclopts import Parameter
 
@@ -86,7 +86,7 @@ def compare(
         else [flights.with_stem(f"{flights.stem}-{number}") for number in range(1, len(controllers) + 1)]
     )
     check_flights(*numbered)
-    evaluations = evaluate_all(controllers, **options.settings())
+    evaluations = evaluate_all(controllers, **_one_task(controllers, options))
     comparison = compare([evaluation.judgement for evaluation in evaluations])
     for file, evaluation in zip(numbered, evaluations, strict=False):
         evaluation.flights.save(file)
@@ -110,7 +110,19 @@ def report(
     from flytune.report.report import write_report
 
     check_file(out, mark=page_mark("report.html"), kind="a page of controllers")
-    evaluations = evaluate_all(controllers, **options.settings())
+    evaluations = evaluate_all(controllers, **_one_task(controllers, options))
     print("\n\n".join(evaluation.judgement.table() for evaluation in evaluations), end="\n\n")
     write_report(out, evaluations)
     print(out)
+
+
+def _one_task(controllers: tuple[str, ...], options: FlightOptions) -> dict[str, Any]:
+    """The settings of flights on one task, which standard error names where the user did not."""
+    from flytune.evaluation.evaluate import shared_task
+
+    settings = options.settings()
+    task, origin = shared_task(controllers, options.task)
+    if origin is not None and len(controllers) > 1:
+        source = f"that of {origin}" if origin else "since no controller says what it was trained for"
+        print(f"every controller flies the task {task.name}, {source}; --task names another", file=sys.stderr)
+    return settings | {"task": task}

@@ -59,7 +59,11 @@ class FlightOptions:
 
     task: Annotated[
         str | None,
-        Parameter(metavar="TASK", help=f"the task to fly: {TASK_HELP} (default: the one it was trained for)"),
+        Parameter(
+            metavar="TASK",
+            help=f"the task to fly: {TASK_HELP} (default: the one it was trained for; of several controllers, that of "
+            "the first learned policy)",
+        ),
     ] = None
     simulator: Annotated[
         Literal["flytune", "pybullet", "mujoco"], Parameter(name="--world", help="the simulator to fly in")

@@ -64,7 +64,7 @@ def evaluate(
         Diverged: the controller returned an action that is not finite.
     """
     found = _find(controller, task, name, dial)
-    flights = fly(found.controller, found.task, name=found.name, **settings)
+    flights = fly(found, found.task, name=found.name, **settings)
     return Evaluation(
         name=found.name,
         task=found.task,
@@ -82,9 +82,32 @@ def evaluate_all(
     dial: Schedule | None = None,
     **settings: Any,
 ) -> list[Evaluation]:
-    """The evaluations of several controllers, see `evaluate`; all of them are found before the first one flies."""
+    """The evaluations of several controllers on one task, see `evaluate`; all are found before the first one flies.
+
+    Where `task` is None, it is that of the first learned policy that says what it was trained for, or the baseline.
+    """
+    task = shared_task(controllers, task)[0]
     found = [_find(controller, task, dial=dial) for controller in controllers]
     return [evaluate(each, **settings) for each in found]
+
+
+def shared_task(
+    controllers: Sequence[str | Controller], task: str | Path | Task | None = None
+) -> tuple[Task, str | None]:
+    """The task that several controllers fly, and the name of the controller that it comes from; None where it is given.
+
+    A single controller flies what it would fly alone.
+
+    Raises:
+        BadInput: a controller or the task cannot be used.
+    """
+    if task is not None:
+        return load_task(task) if isinstance(task, str | Path) else task, None
+    found = [_find(controller, None) for controller in controllers]
+    if len(found) == 1:
+        return found[0].task, found[0].name
+    first = next((each for each in found if each.trained is not None), None)
+    return (first.trained, first.name) if first and first.trained else (load_task("baseline"), "")
 
 
 def _find(

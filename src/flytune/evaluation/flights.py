@@ -34,6 +34,7 @@ class Labels:
     seed: int
     initial_conditions: str  # "clear" or "paper"
     dial: Mapping[str, Any] = dataclasses.field(default_factory=dict)  # dial -> value, or its pairs [time in s, value]
+    made_for: str = ""  # the vehicle that a policy was trained on, where another one flew
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -100,5 +101,6 @@ class Flights(Labels):
             seed=self.seed,
             starts=self.initial_conditions,
             dial=json.dumps(dict(self.dial)),
+            made_for=self.made_for,
         )
         write_bytes(path, content.getvalue(), "flights")

@@ -113,6 +113,7 @@ class Judgement(Labels):
             },
             "efficiency": {"median": median(self.efficiency)},
             "dial": dict(self.dial) or None,
+            "made_for": self.made_for or None,
         }
 
     def _response(self, channel: str) -> dict:
