@@ -28,6 +28,16 @@ def train(
     edits: Annotated[
         Edits, Parameter(help="change the task: reward.velocity.weight=0.08 vehicle=crazyflie-measured ...")
     ] = (),
+    source: Annotated[
+        str | None,
+        Parameter(
+            name="--from",
+            metavar="CONTROLLER",
+            help="go on from a policy in a new run, for instance with another vehicle or other weights: a run "
+            "directory, a policy file, or a policy that ships. A run of ppo also gives its critic to ppo; else the "
+            "critic is new",
+        ),
+    ] = None,
     resume: Annotated[Flag, Parameter(help="continue the training in --out from its checkpoint")] = False,
     tensorboard: Annotated[Flag, Parameter(help="write event files for TensorBoard as well")] = False,
 ) -> None:
@@ -45,10 +55,16 @@ def train(
         wanted = find_trainer(trainer).with_steps(wanted, steps)
     if resume and out is None:
         raise BadInput("resume: needs --out DIR, the run to continue.")
-    with _directory(out, task, wanted, trainer, seed) as out, show_progress() as on_progress:
+    if resume and source is not None:
+        raise BadInput("from: is not allowed with --resume, which continues from a checkpoint. Leave out --from.")
+    start = None if source is None else _start(source, wanted, trainer)
+    if resume and out is not None:
+        _say_if_ended(out)
+    with _directory(out, task, wanted, trainer, seed, source) as out, show_progress() as on_progress:
         run = train(
-            wanted, trainer, seed=seed, out=out, resume=resume, tensorboard=tensorboard, on_progress=on_progress
-        )
+            wanted, trainer, seed=seed, out=out, resume=resume, warm_start=start, tensorboard=tensorboard,
+            on_progress=on_progress,
+        )  # fmt: skip
     if wanted.dial:
         print("measuring the response at each setting of the dial", file=sys.stderr)
         policy = with_maps(run.policy, wanted)
@@ -61,7 +77,36 @@ def train(
     print(out)
 
 
-def _directory(out: Path | None, task: str, wanted: Any, trainer: str, seed: int) -> AbstractContextManager[Path]:
+def _start(source: str, wanted: Any, trainer: str) -> Any:
+    """What a training goes on from, and a line about it.
+
+    Raises:
+        BadInput: it is no policy with weights, or does not fit the task.
+    """
+    from flytune.training.warm_start import find_warm_start
+
+    start = find_warm_start(source, wanted, "from")
+    find_trainer(trainer).check_warm_start(wanted, start.policy, "from")
+    made_for = ", ".join(f"{name} {start.facts[name]}" for name in ("task", "vehicle") if start.facts[name])
+    critic = "" if trainer != "ppo" else "; the critic is that of the run" if start.critic else "; the critic is new"
+    print(f"starting from {source}{f' ({made_for})' if made_for else ''}{critic}", file=sys.stderr)
+    return start
+
+
+def _say_if_ended(out: Path) -> None:
+    """Tell that nothing is left to train, and how to go on."""
+    from flytune.runs.directory import read_facts
+    from flytune.training.warm_start import continue_command
+
+    facts = read_facts(out) if (out / "run.json").exists() else {}
+    if facts.get("finished") and TRAINERS[facts["trainer"]].supports_warm_start:
+        command = continue_command(out, facts["trainer"], facts["seed"])
+        print(f"{out}: this training has ended. To go on from its policy: {command}", file=sys.stderr)
+
+
+def _directory(
+    out: Path | None, task: str, wanted: Any, trainer: str, seed: int, source: str | None
+) -> AbstractContextManager[Path]:
     """The run directory; a new one under `runs/` is named by task, trainer and seed, and by what was changed."""
     from flytune.config import document, nested
     from flytune.runs.naming import new_directory, run_name
@@ -70,4 +115,6 @@ def _directory(out: Path | None, task: str, wanted: Any, trainer: str, seed: int
     if out is not None:
         return nullcontext(out)
     changes = nested.changes(document.plain(load_task(task)), document.plain(wanted))
+    if source is not None:
+        changes["from"] = source
     return new_directory(run_name(f"{wanted.name}-{trainer}-s{seed}", changes))

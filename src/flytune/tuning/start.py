@@ -142,6 +142,6 @@ def _shipped(name: str, task: Task, trainer: str) -> tuple[Path, Path] | None:
     if name not in KNOWN:
         return None
     method, known = find_trainer(trainer), shipped_name(name, trainer)
-    if method.supports_warm_start and method.settings(task).hidden != method.settings(load_task(name)).hidden:
+    if method.tuning_goes_on and method.settings(task).hidden != method.settings(load_task(name)).hidden:
         return None
     return shipped_files(known) if known in shipped_names() else None
