@@ -9,7 +9,7 @@ from pathlib import Path
 from cyclopts import App, CycloptsError, Parameter
 
 import flytune
-from flytune.cli import bench, evaluate, export, reproduce, response_map, rules, show, train, tune
+from flytune.cli import bench, evaluate, export, judge, reproduce, response_map, rules, show, train, tune
 from flytune.cli.refusal import refusal
 from flytune.errors import BadInput, FlytuneError
 
@@ -19,6 +19,7 @@ COMMANDS = (
     evaluate.evaluate,
     evaluate.compare,
     evaluate.report,
+    judge.judge,
     response_map.map,
     tune.tune,
     rules.rules,

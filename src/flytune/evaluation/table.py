@@ -52,6 +52,9 @@ def response_text(judged: Mapping[str, Any]) -> str:
         f"{judged['who']} on {judged['task']} ({judged['vehicle']}{made_for}, world {judged['world']}{dial}): "
         f"{judged['trials']} trials of {judged['duration']:g} s, starts {judged['starts']}, seed {judged['seed']}"
     )
+    if judged["seed"] is None:  # logged elsewhere
+        trials = "1 flight" if judged["trials"] == 1 else f"{judged['trials']} flights"
+        heading = f"{judged['who']}: {trials} of {judged['duration']:g} s, {judged['starts']}"
     crossed = ", ".join(f"{name} {count}" for name, count in judged["violations"].items()) or "none"
     small = ", ".join(f"{axis} {judged['axes'][axis]['small_steps']}" for axis in AXES)
     peak, action = judged["peak_speed"], judged["action"]
