@@ -5,7 +5,7 @@ import pytest
 from flytune.task.files import load_task
 from flytune.training.loop import train
 
-SMALL = {"apg.environments": 4, "apg.window": 10, "apg.updates": 2, "apg.hidden": [8, 8]}
+SMALL = {"apg.environments": 4, "apg.window": 10, "apg.updates": 2, "apg.hidden": [8, 8], "duration": 1.0}
 
 
 @pytest.fixture(scope="session")

@@ -93,7 +93,7 @@ WRONG = {  # what is in the file, further arguments, what is said, and where the
                                      "'speed' is not allowed. Allowed: time, x", None),
     "a unit that is not there": (LOG, [*TO, "--columns", "x=x[inch]"],
                                  "the unit 'inch' is not allowed. Allowed: m, cm, mm, ft", ["--columns", "x=x[m]"]),
-    "a unit of the header": (("t,x [parsec],y,z,yaw", TIME, X, Y, Z, YAW), TO, "the unit 'parsec' is not allowed", None),
+    "a unit of the header": (("t,x [parsec],y,z,yaw", *LOG[1:]), TO, "the unit 'parsec' is not allowed", None),
     "degrees in the target": (LOG, ["--target", "0,0,1,90"], "Did you mean 1.571",
                               ["--target", "0,0,1,1.571"]),
     "three numbers": (LOG, ["--target", "0,0,1"], "four numbers x,y,z,yaw", TO),

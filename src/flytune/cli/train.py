@@ -58,13 +58,14 @@ def train(
     if resume and source is not None:
         raise BadInput("from: is not allowed with --resume, which continues from a checkpoint. Leave out --from.")
     start = None if source is None else _start(source, wanted, trainer)
-    if resume and out is not None:
-        _say_if_ended(out)
+    ended = _ended(out) if resume and out is not None else ""
     with _directory(out, task, wanted, trainer, seed, source) as out, show_progress() as on_progress:
         run = train(
             wanted, trainer, seed=seed, out=out, resume=resume, warm_start=start, tensorboard=tensorboard,
             on_progress=on_progress,
         )  # fmt: skip
+    if ended:
+        print(ended, file=sys.stderr)
     if wanted.dial:
         print("measuring the response at each setting of the dial", file=sys.stderr)
         policy = with_maps(run.policy, wanted)
@@ -93,15 +94,18 @@ def _start(source: str, wanted: Any, trainer: str) -> Any:
     return start
 
 
-def _say_if_ended(out: Path) -> None:
-    """Tell that nothing is left to train, and how to go on."""
+def _ended(out: Path) -> str:
+    """A line on a run of which nothing is left to train, and how to go on; nothing for any other directory."""
     from flytune.runs.directory import read_facts
     from flytune.training.warm_start import continue_command
 
     facts = read_facts(out) if (out / "run.json").exists() else {}
-    if facts.get("finished") and TRAINERS[facts["trainer"]].supports_warm_start:
-        command = continue_command(out, facts["trainer"], facts["seed"])
-        print(f"{out}: this training has ended. To go on from its policy: {command}", file=sys.stderr)
+    if not facts.get("finished") or not TRAINERS[facts["trainer"]].supports_warm_start:
+        return ""
+    return (
+        f"{out}: this training had ended before. To go on from its policy: "
+        f"{continue_command(out, facts['trainer'], facts['seed'])}"
+    )
 
 
 def _directory(

@@ -113,7 +113,7 @@ class Judgement(Labels):
             },
             "efficiency": {"median": median(self.efficiency)},
             "dial": dict(self.dial) or None,
-            "made_for": self.made_for or None,
+            **({"made_for": self.made_for} if self.made_for else {}),
         }
 
     def _response(self, channel: str) -> dict:

@@ -189,7 +189,7 @@ def _from_run(name: str, path: Path, wanted: Task | None) -> FoundController:
     facts = read_facts(path)
     if not (path / "policy.safetensors").exists():
         command = resume_command(path, facts["trainer"], facts["seed"])
-        remedy = f"Continue it with: {command}" if has_checkpoint(path) else "Train it again."
+        remedy = f"Continue it with: {command}" if has_checkpoint(path) else "Train again into another directory."
         raise BadInput(f"{name}: its training has not ended. {remedy}")
     policy = load_policy(path / "policy.safetensors")
     about = {

@@ -126,6 +126,7 @@ def metrics_row(task: Task, measured: dict[str, Any], update: int, steps: int, s
         if isinstance(value, float) and not math.isfinite(value):
             raise Diverged(
                 f"training: {name} is {value} in update {update} ({steps} environment steps). "
-                "A smaller learning_rate, or smaller weights in the reward, may help."
+                "A smaller learning rate (--set apg.learning_rate=VALUE or ppo.learning_rate=VALUE) may help, and so "
+                "may smaller weights in the reward."
             )
     return row
