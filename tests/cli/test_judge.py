@@ -60,7 +60,7 @@ TARGETS = f"{HEADER},target_x,target_y,target_z,target_yaw"
 LOG = (HEADER, TIME, X, Y, Z, YAW)
 WRONG = {  # what is in the file, further arguments, what is said, and where there is one: the remedy that then works
     "no target": (LOG, [], "no column is a target. Give --target x,y,z,yaw", TO),
-    "no yaw": (("t,x,y,z", TIME, X, Y, Z), TO, r"no column is yaw. Found: t, x, y, z. Give .*yaw=0",
+    "no yaw": (("t,x,y,z", TIME, X, Y, Z), TO, r"no column is yaw. Found: t, x, y, z. Give .*yaw=0\.",
                ["--columns", "yaw=0"]),
     "other names": (("a,b,c,d,e", TIME, X, Y, Z, YAW), TO, "no column is time, x, y, z, yaw. Found: a, b, c, d, e",
                     ["--columns", "time=a[s]", "x=b", "y=c", "z=d", "yaw=e"]),

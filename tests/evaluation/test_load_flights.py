@@ -273,3 +273,16 @@ def test_arrays_of_a_users_own_are_judged_and_a_log_that_was_saved_too(tmp_path,
     several = {"position": np.stack([position] * 3), "attitude": np.stack([np.stack(QUATERNION, axis=-1)] * 3)}
     np.savez(tmp_path / "three.npz", time=TIME, **several, velocity=several["position"], target_position=TARGET[:3])
     assert judge(load_flights(tmp_path / "three.npz")).peak_speed.shape == (3,)
+
+
+def test_a_position_that_becomes_infinite_is_a_crash_and_one_that_ends_before_the_log_ends_the_flight(tmp_path):
+    for value, crashed, duration in ((np.inf, [True], 8.0), (np.nan, [False], 5.99)):
+        x, told = np.where(TIME >= 6, value, X), []
+        path = written(tmp_path / "log.csv", "t,x,y,z,yaw", TIME, x, Y, Z, YAW)
+        judged = judge(load_flights(path, target=TARGET, on_message=told.append))
+        assert judged.crashed.tolist() == crashed and judged.duration == pytest.approx(duration)
+        assert judged.settled("position") == (0 if crashed[0] else 1)
+        assert any("infinite from 6.00 s on" in line for line in told) == crashed[0]
+    path = written(tmp_path / "log.csv", "t,x,y,z,yaw", TIME, np.nan * X, Y, Z, YAW)
+    with pytest.raises(BadInput, match="has no position"):
+        load_flights(path, target=TARGET)

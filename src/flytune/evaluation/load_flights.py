@@ -1,6 +1,7 @@
 """Reading flights: what `evaluate --flights` writes, arrays of a user's own, and logs in text."""
 
 import zipfile
+import zlib
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -24,6 +25,7 @@ STEPS = {
     "ns": (4e5, 250e6),
 }  # between samples: 4 to 2500 Hz
 FARTHEST = 100.0  # m; a position without a unit that reaches farther is probably in another one
+UNREADABLE = (OSError, EOFError, ValueError, KeyError, IndexError, TypeError, zipfile.BadZipFile, zlib.error)
 STILL = 1e-6  # m and rad; a target that changes by less stays the same
 MOST_STEPS = 50  # of the target in one log; one that changes more often follows a path
 
@@ -110,7 +112,7 @@ def _from_npz(
             return Flights.from_arrays(arrays)
     except BadInput:
         raise
-    except (OSError, ValueError, KeyError, IndexError, TypeError, zipfile.BadZipFile) as error:
+    except UNREADABLE as error:
         raise BadInput(f"{path}: is no file of flights ({error}). {allowed}") from None
     missing = [name for name in ("time", "position") if name not in arrays]
     missing += [] if {"yaw", "attitude"} & arrays.keys() else ["yaw"]

@@ -133,7 +133,9 @@ def check_columns(table: LogTable, chosen: Mapping[str, Any], needed: Sequence[s
         return
     there = ", ".join(table.header[:30]) + (", ..." if len(table.header) > 30 else "")
     give = " ".join(f"'{quantity}=COLUMN'" for quantity in missing)
-    number = " A number in place of COLUMN is a constant, for instance yaw=0." if missing[-1].endswith("yaw") else ""
+    number = (
+        " Or name the quaternion, qx, qy, qz, qw; or give a constant, for instance yaw=0." if "yaw" in missing else ""
+    )
     raise BadInput(f"{table.path}: no column is {', '.join(missing)}. Found: {there}. Give --columns {give}.{number}")
 
 

@@ -32,7 +32,7 @@ class LogTable:
     first: int  # lines before the first row of numbers
 
     def read(self, columns: Sequence[int]) -> np.ndarray:
-        """The numbers [rows, columns] of some columns; NaN where a cell is empty or not finite.
+        """The numbers [rows, columns] of some columns; NaN where a cell is empty.
 
         Raises:
             BadInput: a cell is no number, a row is too short, or there is no row.
@@ -56,9 +56,7 @@ class LogTable:
                 numbers.append(self._number(cells[column], number, column))
         if not numbers:
             raise BadInput(f"{self.path}: has no row of numbers. Allowed: a header, and rows of numbers below it.")
-        table = np.frombuffer(numbers, dtype=np.float64).reshape(-1, len(columns)).copy()
-        table[~np.isfinite(table)] = np.nan
-        return table
+        return np.frombuffer(numbers, dtype=np.float64).reshape(-1, len(columns)).copy()
 
     def _rows(self) -> Iterator[tuple[int, list[str]]]:
         for number, line in _lines(self.path, self.encoding):

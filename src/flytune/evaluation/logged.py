@@ -122,7 +122,9 @@ def _one(
 ) -> Flights:
     """One flight [1, K] at 100 Hz from arrays [L, ...]."""
     clock, arrays = _increasing(where, clock, arrays, on_message)
-    grid = make_grid(where, clock, clock[0], clock[-1], longest_gap)
+    arrays, crashed = _until_lost(where, clock, arrays, on_message)
+    known_until = clock[np.isfinite(arrays["position"]).all(axis=1)][-1]  # a log that goes on without a position ends
+    grid = make_grid(where, clock, clock[0], known_until, longest_gap)
     error = max(grid.error(clock, arrays["position"][:, axis]) for axis in range(3))
     rate = (clock.size - 1) / (clock[-1] - clock[0])
     how = "taken as it is" if error == 0 else f"interpolated to 100 Hz, error at most about {error * 1e3:.2g} mm"
@@ -144,7 +146,7 @@ def _one(
     return Flights(
         **{field: values[None] for field, values in fields.items()},
         time=grid.time,
-        crashed=np.zeros(1, bool),
+        crashed=np.array([crashed]),
         margins={},
         target_position=target,
         target_yaw=target_yaw,
@@ -153,6 +155,29 @@ def _one(
         name=where,
         **LOGGED,
     )
+
+
+def _until_lost(
+    where: str, clock: np.ndarray, arrays: dict[str, np.ndarray], on_message: Callable[[str], None]
+) -> tuple[dict[str, np.ndarray], bool]:
+    """The arrays, and whether the flight crashed: where the position becomes infinite, the row before it is held.
+
+    Raises:
+        BadInput: there is no position.
+    """
+    lost = np.isinf(arrays["position"]).any(axis=1)
+    arrays = {field: np.where(np.isinf(values), np.nan, values) for field, values in arrays.items()}
+    first = int(np.argmax(lost)) if lost.any() else clock.size
+    if not np.isfinite(arrays["position"][:first]).all(axis=1).any():
+        raise BadInput(f"{where}: has no position. Allowed: numbers from the start on.")
+    if first < clock.size:
+        on_message(
+            f"{where}: the position is infinite from {clock[first] - clock[0]:.2f} s on, which counts as a crash"
+        )
+        last = first - 1 - int(np.argmax(np.isfinite(arrays["position"][:first][::-1]).all(axis=1)))
+        for values in arrays.values():
+            values[first:] = values[last]
+    return arrays, first < clock.size
 
 
 def _increasing(
