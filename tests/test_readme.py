@@ -39,6 +39,11 @@ def run_small(command, folder, codes=(0,)):
     answer = subprocess.run(["sh", "-c", line], cwd=folder, capture_output=True, text=True, timeout=900, check=False)
     assert answer.returncode in codes, f"{command}\n{answer.stderr}"
     assert answer.stdout or to_a_file, command
+    if typed.startswith("train"):  # the name tells that it was made small; the commands after it know the usual one
+        made = folder / answer.stdout.splitlines()[-1]
+        usual = made.with_name(re.sub(r"-[0-9a-f]{6}$", "", made.name))
+        if not usual.exists():
+            made.rename(usual)
 
 
 @pytest.mark.slow

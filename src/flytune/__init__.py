@@ -9,6 +9,7 @@
 Each command of the command line is one call here:
 
 - train: `train`; evaluate: `evaluate`, or `find_controller`, `fly` and `judge` one by one
+- judge: `load_flights`, or `flights_from` arrays, then `judge`
 - compare, report: `evaluate_all`, then `compare` of the judgements, and `write_report`
 - tune, rules: `tune`, `load_rules`; reproduce: `reproduce`; bench: `bench`
 - export: `export_policy`, or `save_onnx` and `save_policy`; list: `catalogue`; show: `load_task`, `write_task`

@@ -21,6 +21,8 @@ from .evaluation.flights import Flights as Flights
 from .evaluation.fly import fly as fly
 from .evaluation.judge import Judgement as Judgement
 from .evaluation.judge import judge as judge
+from .evaluation.load_flights import load_flights as load_flights
+from .evaluation.logged import flights_from as flights_from
 from .evaluation.measure_map import measure_map as measure_map
 from .export import export_policy as export_policy
 from .export.onnx import save_onnx as save_onnx

@@ -3,11 +3,14 @@
 import json
 import re
 import shutil
+import subprocess
 from pathlib import Path
 
 import numpy as np
 import pytest
-from tests.command import flytune, interrupted, refused
+from tests.command import COMMAND, flytune, interrupted, refused
+
+from flytune.config.files import held
 
 SMALL = [
     "apg.environments=4",
@@ -26,7 +29,7 @@ def folder(tmp_path_factory):
 def run(folder):
     answer = flytune("train", "baseline", "--set", *SMALL, cwd=folder)
     lines = answer.stdout.splitlines()
-    assert lines[-1] == "runs/baseline-apg-s0"
+    assert re.fullmatch(r"runs/baseline-apg-s0-[0-9a-f]{6}", lines[-1])  # six digits for the settings that differ
     assert lines[-2].startswith("settled ")
     assert "reward" in answer.stderr and "steps" in answer.stderr
     return lines[-1]
@@ -34,6 +37,35 @@ def run(folder):
 
 def test_a_second_training_without_out_gets_a_number_of_its_own(folder, run):
     assert flytune("train", "baseline", "--set", *SMALL, cwd=folder).stdout.splitlines()[-1] == f"{run}-2"
+
+
+def test_a_training_with_other_settings_gets_another_name_and_one_without_changes_has_no_digits(folder, run):
+    other = flytune("train", "baseline", "--set", *SMALL, "apg.updates=1", cwd=folder).stdout.splitlines()[-1]
+    assert other != run and re.fullmatch(r"runs/baseline-apg-s0-[0-9a-f]{6}", other)
+    (folder / "short.toml").write_text((folder / run / "task.toml").read_text())
+    assert flytune("train", "short.toml", cwd=folder).stdout.splitlines()[-1] == "runs/baseline-apg-s0"
+
+
+def test_a_directory_in_which_another_process_trains_is_refused(folder, run, monkeypatch, capsys):
+    monkeypatch.chdir(folder)
+    with held(Path(run)):
+        for arguments in (["baseline"], [f"{run}/task.toml", "--resume"]):
+            line = refused("train", *arguments, "--out", run, capsys=capsys)
+            assert line.startswith(f"out: {run} is being written by another process. Give another directory")
+
+
+@pytest.mark.slow
+def test_six_trainings_that_start_at_once_have_a_directory_each_and_one_gets_a_directory_that_all_ask_for(tmp_path):
+    def started(*arguments):
+        command = [*COMMAND, "train", "baseline", "--set", *SMALL, *arguments]
+        return [subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.PIPE, text=True) for _ in range(6)]
+
+    printed = [each.communicate()[0].splitlines()[-1] for each in started()]
+    assert len(set(printed)) == 6 and all((tmp_path / path / "policy.safetensors").exists() for path in printed)
+    same = started("--out", "same")
+    outputs = [each.communicate()[0] for each in same]
+    assert sorted(each.returncode for each in same) == [0, 2, 2, 2, 2, 2]
+    assert sorted(output.splitlines()[-1:] for output in outputs) == [[]] * 5 + [["same"]]
 
 
 def test_evaluate_prints_exactly_one_json_object_with_the_keys_of_the_contract(folder, run):

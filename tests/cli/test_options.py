@@ -11,12 +11,13 @@ import pytest
 from flytune.cli.main import main, make_app
 
 OPTIONS = {
-    "train": "TASK --trainer --seed --steps --out --set --resume --tensorboard",
+    "train": "TASK --trainer --seed --steps --out --set --from --resume --tensorboard",
     "evaluate": "CONTROLLER --task --world --world-set --trials --seed --duration --starts --dial --json --out "
     "--flights",
     "compare": "CONTROLLER --task --world --world-set --trials --seed --duration --starts --dial --json --out "
     "--flights",
     "report": "CONTROLLER --task --world --world-set --trials --seed --duration --starts --dial --out",
+    "judge": "FILE --columns --target --start --gap --json",
     "map": "CONTROLLER --dial --measure --json",
     "tune": "TASK --settling-time --at-most --tolerance --overshoot --error --axis --percentile --set --rules "
     "--trainer "
@@ -72,7 +73,9 @@ def test_a_command_explains_every_option_it_has(command, capsys):
     assert shown.startswith(f"Usage: flytune {command}")
     words = shown.replace("│", " ").replace("*", " ").split("\n")
     listed = [
-        line.split()[0] for line in words if line.split() and line.split()[0].startswith(("--", "TASK", "CONT", "WHAT"))
+        line.split()[0]
+        for line in words
+        if line.split() and line.split()[0].startswith(("--", "TASK", "CONT", "WHAT", "FILE"))
     ]
     assert [name for name in OPTIONS[command].split() if name not in listed] == []
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from flytune.config.files import check_file, make_folder, write_bytes, write_json, write_text
+from flytune.config.files import check_file, held, make_folder, write_bytes, write_json, write_text
 from flytune.errors import BadInput
 
 
@@ -59,3 +59,12 @@ def test_a_path_that_no_file_can_have_is_refused_before_writing(tmp_path: Path):
     with pytest.raises(BadInput, match=r"^flights: .*none is no folder"):
         check_file(tmp_path / "none" / "x", "flights")
     check_file(tmp_path / ("x" * 300))
+
+
+def test_a_folder_that_another_holds_is_refused_until_it_is_free(tmp_path: Path):
+    with held(tmp_path):
+        refusal = r"^out: .* is being written by another process\. Give another directory, or wait for its end\.$"
+        with pytest.raises(BadInput, match=refusal), held(tmp_path):
+            pass
+    with held(tmp_path):
+        assert list(tmp_path.iterdir()) == []

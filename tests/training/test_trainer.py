@@ -85,7 +85,7 @@ def test_a_warm_start_from_other_layers_or_another_squash_is_refused_and_nothing
 @pytest.mark.parametrize("trainer", [name for name, trainer in TRAINERS.items() if not trainer.supports_warm_start])
 def test_a_warm_start_is_refused_by_a_trainer_without_one_and_nothing_is_written(small_task, policy, tmp_path, trainer):
     with pytest.raises(
-        BadInput, match=f"^warm_start: trainer {trainer} cannot start from a policy. Allowed: trainer apg."
+        BadInput, match=f"^warm_start: trainer {trainer} cannot start from a policy. Allowed: trainer apg, ppo."
     ):
         train(small_task, trainer, warm_start=policy, out=tmp_path / "run")
     assert list(tmp_path.iterdir()) == []

@@ -24,10 +24,12 @@ File = Annotated[Path, Parameter(name="--out", metavar="PATH", help="the file")]
 
 def export(controller: PolicyName, /, *, file_format: Format, out: File) -> None:
     """Write a policy for use outside flytune."""
+    from flytune.control.policy import FORMAT as SAFETENSORS
     from flytune.export import export_policy
+    from flytune.export.onnx import FORMAT_VALUE as ONNX
     from flytune.runs.find import find_controller, split_setting
 
-    check_file(out)
+    check_file(out, mark={"onnx": ONNX, "safetensors": SAFETENSORS}[file_format].encode(), kind="a policy")
     found = find_controller(controller)
     _, setting = split_setting(controller)
     print(export_policy(found.fixed() if setting else found, out, file_format))

@@ -10,7 +10,7 @@ from typing import Annotated, Literal
 from cyclopts import App, CycloptsError, Parameter
 
 import flytune
-from flytune.cli import bench, evaluate, export, reproduce, response_map, rules, show, train, tune
+from flytune.cli import bench, evaluate, export, judge, reproduce, response_map, rules, show, train, tune
 from flytune.cli.refusal import refusal
 from flytune.errors import BadInput, FlytuneError, check_installed
 
@@ -20,6 +20,7 @@ COMMANDS = (
     evaluate.evaluate,
     evaluate.compare,
     evaluate.report,
+    judge.judge,
     response_map.map,
     tune.tune,
     rules.rules,

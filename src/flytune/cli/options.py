@@ -61,7 +61,11 @@ class FlightOptions:
 
     task: Annotated[
         str | None,
-        Parameter(metavar="TASK", help=f"the task to fly: {TASK_HELP} (default: the one it was trained for)"),
+        Parameter(
+            metavar="TASK",
+            help=f"the task to fly: {TASK_HELP} (default: the one it was trained for; of several controllers, that of "
+            "the first learned policy)",
+        ),
     ] = None
     simulator: Annotated[
         Literal["flytune", "pybullet", "mujoco"], Parameter(name="--world", help="the simulator to fly in")
@@ -121,13 +125,28 @@ def assignments(texts: Sequence[str]) -> dict[str, Any]:
     return values
 
 
-def check_outputs(folder: Path | None, flights: Path | None) -> None:
-    """Refuse a folder or a file of trajectories that cannot be written, before anything flies.
+def check_folder(folder: Path | None, controller: str = "") -> None:
+    """Refuse a folder that cannot be written, or that holds the run of another controller, before anything flies.
 
     Raises:
-        BadInput: one of them cannot be written.
+        BadInput: it is a file, or another run.
     """
-    if flights is not None:
-        check_file(flights, "flights")
-    if folder is not None and os.path.exists(folder) and not os.path.isdir(folder):
+    if folder is None or not os.path.exists(folder):
+        return
+    if not os.path.isdir(folder):
         raise BadInput(f"out: {folder} is a file. Allowed: a folder, which may be new.")
+    own = os.path.isdir(controller) and os.path.samefile(folder, controller)
+    if not own and os.path.exists(folder / "run.json"):
+        raise BadInput(f"out: {folder} is the run directory of another training. Give another folder.")
+
+
+def check_flights(*files: Path) -> None:
+    """Refuse files of trajectories that cannot be written, or that would replace something else.
+
+    Raises:
+        BadInput: one of them.
+    """
+    from flytune.evaluation.flights import MARK
+
+    for file in files:
+        check_file(file, "flights", mark=MARK, kind="a file of flights")

@@ -63,7 +63,7 @@ class TuneOptions:
     trainer: Annotated[
         EveryTaskTrainerName,
         Parameter(
-            help=f"how to learn: {' and '.join(trainer_names(warm_start=True))} continues from the last policy, "
+            help=f"how to learn: {' and '.join(trainer_names(tuning_goes_on=True))} continues from the last policy, "
             "the others start from new weights"
         ),
     ] = DEFAULT_TRAINER

@@ -62,7 +62,12 @@ def overlay(below: Mapping[str, Any], above: Mapping[str, Any]) -> dict[str, Any
     return result
 
 
+def changes(before: Mapping[str, Any], after: Mapping[str, Any]) -> dict[str, Any]:
+    """Path and new value of everything in which two nested tables differ, names and sources apart; None where gone."""
+    one, other = (dict(leaves(table, skip=LABELS)) for table in (before, after))
+    return {path: other.get(path) for path in sorted(one.keys() | other.keys()) if one.get(path) != other.get(path)}
+
+
 def first_difference(first: Mapping[str, Any], second: Mapping[str, Any]) -> str | None:
     """The path of the first value in which two nested tables differ, names and sources apart; None where none does."""
-    one, other = (dict(leaves(table, skip=LABELS)) for table in (first, second))
-    return next((path for path in sorted(one.keys() | other.keys()) if one.get(path) != other.get(path)), None)
+    return next(iter(changes(first, second)), None)

@@ -87,7 +87,10 @@ class ResponseMap:
         """Value, as a logarithm where it has one, and logarithm of the settling time of all settings that settle."""
         known = [(value, time) for value, time in zip(self.values, self.monotone, strict=True) if time is not None]
         if len(known) < 2:
-            raise BadInput(f"dial {self.dial}: fewer than two settings settle. Train the policy longer.")
+            raise BadInput(
+                f"dial {self.dial}: fewer than two settings settle. Set the dial itself, CONTROLLER@{self.dial}=VALUE, "
+                "or train longer: `flytune train TASK --from CONTROLLER`."
+            )
         values, times = np.asarray(known, float).T
         return np.log(values) if self._positive else values, np.log(times)
 
@@ -109,7 +112,10 @@ class ResponseMap:
                 np.log(np.asarray([time for time in found.monotone if time is not None], float))
             return found
         except (TypeError, ValueError, AttributeError, KeyError):
-            raise BadInput("map: the response map of the policy is damaged. Measure it again: `flytune map`.") from None
+            raise BadInput(
+                "map: the response map of the policy is damaged. Set the dial itself, or measure the map: "
+                "`flytune map CONTROLLER --measure 11`."
+            ) from None
 
 
 def response_map(policy: Any, dial: str | None = None) -> ResponseMap | None:

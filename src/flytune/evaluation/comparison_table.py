@@ -111,6 +111,12 @@ def conditions(comparison: "Comparison") -> str:
         same = len(set(flown.values())) == 1
         values = flown[first.name] if same else ", ".join(f"{value} ({name})" for name, value in flown.items())
         text.append(f"{LABELS.get(field, field)} {values}")
+    for judgement in judgements:
+        if judgement.made_for:
+            text.append(
+                f"{judgement.name} was trained on {judgement.made_for}: its actions are relative to the hover speed of "
+                f"{judgement.vehicle}, which flies"
+            )
     return "; ".join(text)
 
 

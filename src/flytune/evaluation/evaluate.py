@@ -5,15 +5,20 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from flytune.config import document
 from flytune.config.files import make_folder, write_json
+from flytune.config.nested import first_difference
 from flytune.control.controller import Controller
 from flytune.control.schedule import Schedule
 from flytune.evaluation.flights import Flights
 from flytune.evaluation.fly import fly
 from flytune.evaluation.judge import Judgement, judge
 from flytune.runs.find import FoundController, find_controller
+from flytune.runs.naming import run_name
 from flytune.task.files import load_task
 from flytune.task.task import Task
+
+EVALUATION = "evaluation.json"
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
@@ -59,7 +64,7 @@ def evaluate(
         Diverged: the controller returned an action that is not finite.
     """
     found = _find(controller, task, name, dial)
-    flights = fly(found.controller, found.task, name=found.name, **settings)
+    flights = fly(found, found.task, name=found.name, **settings)
     return Evaluation(
         name=found.name,
         task=found.task,
@@ -77,9 +82,32 @@ def evaluate_all(
     dial: Schedule | None = None,
     **settings: Any,
 ) -> list[Evaluation]:
-    """The evaluations of several controllers, see `evaluate`; all of them are found before the first one flies."""
+    """The evaluations of several controllers on one task, see `evaluate`; all are found before the first one flies.
+
+    Where `task` is None, it is that of the first learned policy that says what it was trained for, or the baseline.
+    """
+    task = shared_task(controllers, task)[0]
     found = [_find(controller, task, dial=dial) for controller in controllers]
     return [evaluate(each, **settings) for each in found]
+
+
+def shared_task(
+    controllers: Sequence[str | Controller], task: str | Path | Task | None = None
+) -> tuple[Task, str | None]:
+    """The task that several controllers fly, and the name of the controller that it comes from; None where it is given.
+
+    A single controller flies what it would fly alone.
+
+    Raises:
+        BadInput: a controller or the task cannot be used.
+    """
+    if task is not None:
+        return load_task(task) if isinstance(task, str | Path) else task, None
+    found = [_find(controller, None) for controller in controllers]
+    if len(found) == 1:
+        return found[0].task, found[0].name
+    first = next((each for each in found if each.trained is not None), None)
+    return (first.trained, first.name) if first and first.trained else (load_task("baseline"), "")
 
 
 def _find(
@@ -93,11 +121,19 @@ def _find(
     return found.with_dial(dial) if dial else found
 
 
-def write_evaluation(folder: Path, judgement: Judgement) -> None:
-    """Write `evaluation.json` into a folder, which may be new.
+def write_evaluation(folder: Path, judgement: Judgement, task: Task | None = None) -> Path:
+    """Write `evaluation.json` into a folder, which may be new; returns the file.
+
+    `evaluation.json` of a run directory belongs to the task of the run. Where `task`, which was flown, is another one,
+    the file is `evaluation-TASK.json`.
 
     Raises:
         BadInput: the file cannot be written.
     """
     make_folder(folder)
-    write_json(folder / "evaluation.json", judgement.to_dict())
+    own = folder / "task.toml"
+    name = EVALUATION
+    if task is not None and own.exists() and first_difference(document.plain(load_task(own)), document.plain(task)):
+        name = f"{Path(EVALUATION).stem}-{run_name(task.name, {})}.json"
+    write_json(folder / name, judgement.to_dict())
+    return folder / name

@@ -11,6 +11,8 @@ import numpy as np
 
 from flytune.config.files import write_bytes
 
+MARK = b"target_yaw.npy"  # in every file that `Flights.save` writes, near its end
+
 COLUMNS = {  # per sample: the unit of a field, and the names of its columns in a file
     "position": ("m", "x y z"),
     "attitude": ("1", "qx qy qz qw"),
@@ -29,9 +31,10 @@ class Labels:
     task: str
     vehicle: str
     simulator: str
-    seed: int
-    initial_conditions: str  # "clear" or "paper"
+    seed: int | None  # None for flights that were logged elsewhere
+    initial_conditions: str  # "clear" or "paper"; "as logged" elsewhere
     dial: Mapping[str, Any] = dataclasses.field(default_factory=dict)  # dial -> value, or its pairs [time in s, value]
+    made_for: str = ""  # the vehicle that a policy was trained on, where another one flew
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -54,6 +57,7 @@ class Flights(Labels):
     target_position: np.ndarray  # [3] m
     target_yaw: float  # rad
     speed_bound: float | None  # m/s, of the task's speed termination; None where it has none
+    missing: tuple[str, ...] = ()  # fields that a log lacks, of `velocity` and those below it; they are NaN
 
     def __repr__(self) -> str:
         crashed = f", {np.count_nonzero(self.crashed)} crashed" if self.crashed.any() else ""
@@ -79,6 +83,8 @@ class Flights(Labels):
         """
         columns = {"time": ("s", np.broadcast_to(self.time, self.position.shape[:2]))}
         for field, (unit, names) in COLUMNS.items():
+            if field in self.missing:
+                continue
             parts = np.moveaxis(getattr(self, field), -1, 0)
             columns |= {name: (unit, part) for name, part in zip(names.split(), parts, strict=True)}
         columns |= {f"margin_{name}": ("1", margin) for name, margin in self.margins.items()}
@@ -88,6 +94,8 @@ class Flights(Labels):
             data=np.stack([values for _, values in columns.values()], axis=-1).astype(np.float32),
             columns=np.array(list(columns)),
             units=np.array([unit for unit, _ in columns.values()]),
+            time=self.time,
+            speed_bound=np.nan if self.speed_bound is None else self.speed_bound,
             crashed=self.crashed,
             target_position=self.target_position,
             target_yaw=self.target_yaw,
@@ -95,8 +103,51 @@ class Flights(Labels):
             task=self.task,
             vehicle=self.vehicle,
             world=self.simulator,
-            seed=self.seed,
+            seed=-1 if self.seed is None else self.seed,
             starts=self.initial_conditions,
             dial=json.dumps(dict(self.dial)),
+            made_for=self.made_for,
         )
         write_bytes(path, content.getvalue(), "flights")
+
+    @classmethod
+    def from_arrays(cls, arrays: Mapping[str, np.ndarray]) -> "Flights":
+        """The flights that `save` has written, from its arrays; they are judged to exactly the same numbers.
+
+        Raises:
+            KeyError, ValueError: an array is missing or has another shape.
+        """
+        data, names = np.asarray(arrays["data"]), [str(name) for name in arrays["columns"]]
+        trials, samples, _ = data.shape
+        fields, missing = {}, []
+        for field, (_, columns) in COLUMNS.items():
+            wanted = columns.split()
+            if field not in ("position", "attitude") and not set(wanted) & set(names):
+                missing.append(field)
+                fields[field] = np.full((trials, samples, len(wanted)), np.nan)
+            else:
+                fields[field] = data[..., [names.index(name) for name in wanted]]
+        margins = {name.removeprefix("margin_"): data[..., index] for index, name in enumerate(names)
+                   if name.startswith("margin_")}  # fmt: skip
+        seed, bound, position = int(arrays["seed"]), float(arrays["speed_bound"]), np.asarray(arrays["target_position"])
+        time, crashed = np.asarray(arrays["time"], np.float64), np.asarray(arrays["crashed"], bool)
+        if time.shape != (samples,) or crashed.shape != (trials,) or position.shape != (3,):
+            raise ValueError(f"time {time.shape}, crashed {crashed.shape} or target_position {position.shape}")
+        return cls(
+            **fields,
+            time=time,
+            crashed=crashed,
+            margins=margins,
+            target_position=position,
+            target_yaw=float(arrays["target_yaw"]),
+            speed_bound=None if np.isnan(bound) else bound,
+            missing=tuple(missing),
+            name=str(arrays["who"]),
+            task=str(arrays["task"]),
+            vehicle=str(arrays["vehicle"]),
+            simulator=str(arrays["world"]),
+            seed=None if seed < 0 else seed,
+            initial_conditions=str(arrays["starts"]),
+            dial=json.loads(str(arrays["dial"])),
+            made_for=str(arrays["made_for"]),
+        )

@@ -64,8 +64,9 @@ def fly(
         BadInput: an argument out of range, or a simulator that is not installed.
         Diverged: the controller answered a finite observation with an action that is not finite.
     """
+    made_for = ""
     if isinstance(controller, FoundController):
-        controller, name = controller.controller, name or controller.name
+        controller, name, made_for = controller.controller, name or controller.name, controller.made_for(task)
     family, task = task, task.at({name: values[0] for name, values in settings_along(controller, task, 1).items()})
     duration = task.duration if duration is None else duration
     own = isinstance(initial_conditions, InitialState)
@@ -102,6 +103,7 @@ def fly(
         seed=seed,
         initial_conditions=starts_name,
         dial=shown_setting(controller),
+        made_for=made_for,
     )
 
 

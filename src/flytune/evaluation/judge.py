@@ -87,7 +87,7 @@ class Judgement(Labels):
             "vehicle": self.vehicle,
             "world": self.simulator,
             "trials": self.trials,
-            "seed": int(self.seed),
+            "seed": None if self.seed is None else int(self.seed),
             "starts": self.initial_conditions,
             "duration": self.duration,
             "axes": {
@@ -113,6 +113,7 @@ class Judgement(Labels):
             },
             "efficiency": {"median": median(self.efficiency)},
             "dial": dict(self.dial) or None,
+            **({"made_for": self.made_for} if self.made_for else {}),
         }
 
     def _response(self, channel: str) -> dict:
@@ -146,7 +147,8 @@ def judge(flights: Flights) -> Judgement:
     duration = round(flights.duration, 6)
     crashed = _crashed(flights)
     responses = {name: channel.response(time, crashed) for name, channel in _channels(flights, time, crashed).items()}
-    action = np.asarray(flights.action, dtype=np.float64)
+    action, velocity = _double(flights.action), _double(flights.velocity)
+    unknown = np.full(flights.trials, np.nan)  # of what the log of a flight lacks
     start = np.asarray(flights.position[:, 0], dtype=np.float64) - flights.target_position
     bound = lower_bounds.settling_time_bound(np.linalg.norm(start, axis=-1), flights.speed_bound)
     fields: dict[str, Any] = {field.name: getattr(flights, field.name) for field in dataclasses.fields(Labels)}
@@ -158,9 +160,9 @@ def judge(flights: Flights) -> Judgement:
         secondary_settling_time={
             band: {name: response[band] for name, response in responses.items()} for band in SECONDARY_BANDS
         },
-        peak_speed=metrics.peak_speed(np.asarray(flights.velocity, dtype=np.float64)),
-        action_rms=metrics.action_rms(action),
-        action_total_variation=metrics.action_total_variation(action),
+        peak_speed=unknown if "velocity" in flights.missing else metrics.peak_speed(velocity),
+        action_rms=unknown if "action" in flights.missing else metrics.action_rms(action),
+        action_total_variation=unknown if "action" in flights.missing else metrics.action_total_variation(action),
         efficiency=lower_bounds.efficiency(bound, responses["position"]["settling_time"]),
         infeasible=lower_bounds.infeasible(bound, duration, flights.margins),
         crashed=crashed,
@@ -201,8 +203,8 @@ class _Channel:
 def _channels(flights: Flights, time: Float[np.ndarray, "K"], crashed: PerTrialFlag) -> dict[str, _Channel]:
     """The five channels: signed errors (x, y, z), wrapped and unwrapped ones (yaw), a distance (position)."""
     lost = crashed[:, None, None]
-    error = np.where(lost, 0.0, np.asarray(flights.position, dtype=np.float64) - flights.target_position)
-    attitude = np.where(lost, [0.0, 0.0, 0.0, 1.0], np.asarray(flights.attitude, dtype=np.float64))
+    error = np.where(lost, 0.0, _double(flights.position) - flights.target_position)
+    attitude = np.where(lost, [0.0, 0.0, 0.0, 1.0], _double(flights.attitude))
     yaw = metrics.yaw_angle(attitude)
     turn, wrapped = metrics.unwrapped_yaw_error(yaw, flights.target_yaw), metrics.wrap_angle(yaw - flights.target_yaw)
     along, distance = metrics.error_along_start(error), np.linalg.norm(error, axis=-1)
@@ -217,8 +219,8 @@ def _channels(flights: Flights, time: Float[np.ndarray, "K"], crashed: PerTrialF
 
 def _crashed(flights: Flights) -> PerTrialFlag:
     """Which trials are marked as crashed, left the ball around the target, or hold a state that is not finite."""
-    states = (flights.position, flights.attitude, flights.velocity, flights.body_rate)
-    lost = [~np.isfinite(state).all(axis=(1, 2)) for state in states]
+    fields = [name for name in ("position", "attitude", "velocity", "body_rate") if name not in flights.missing]
+    lost = [~np.isfinite(getattr(flights, name)).all(axis=(1, 2)) for name in fields]
     with np.errstate(over="ignore", invalid="ignore"):
         distance = np.linalg.norm(flights.position - flights.target_position, axis=-1)
     radius = np.maximum(CRASH_DISTANCE, 2 * distance[:, :1])  # a start far away doubles its own distance
@@ -227,6 +229,11 @@ def _crashed(flights: Flights) -> PerTrialFlag:
 
 def _settling(settling_time: PerTrial) -> dict:
     return {"settled": _count(np.isfinite(settling_time)), "settling_time": summary(settling_time, TIMES)}
+
+
+def _double(values: np.ndarray) -> np.ndarray:
+    """Values in double precision and in one order in memory: another order adds up to other last bits."""
+    return np.ascontiguousarray(values, dtype=np.float64)
 
 
 def _count(flags: PerTrialFlag) -> int:

@@ -47,10 +47,14 @@ def _row(name: str, channel: Mapping[str, Any], trials: int) -> dict[str, Any]:
 def response_text(judged: Mapping[str, Any]) -> str:
     """One judgement for a terminal: its conditions, the response table, and what does not belong to one channel."""
     dial = "".join(f", dial {name} {_shown(value)}" for name, value in (judged.get("dial") or {}).items())
+    made_for = f", made for {judged['made_for']}" if judged.get("made_for") else ""
     heading = (
-        f"{judged['who']} on {judged['task']} ({judged['vehicle']}, world {judged['world']}{dial}): "
+        f"{judged['who']} on {judged['task']} ({judged['vehicle']}{made_for}, world {judged['world']}{dial}): "
         f"{judged['trials']} trials of {judged['duration']:g} s, starts {judged['starts']}, seed {judged['seed']}"
     )
+    if judged["seed"] is None:  # logged elsewhere
+        trials = "1 flight" if judged["trials"] == 1 else f"{judged['trials']} flights"
+        heading = f"{judged['who']}: {trials} of {judged['duration']:g} s, {judged['starts']}"
     crossed = ", ".join(f"{name} {count}" for name, count in judged["violations"].items()) or "none"
     small = ", ".join(f"{axis} {judged['axes'][axis]['small_steps']}" for axis in AXES)
     peak, action = judged["peak_speed"], judged["action"]

@@ -38,6 +38,8 @@ FORMULA_ERROR = 32 * UNIT_ROUNDOFF  # of an input that a formula gives: each of 
 LIMIT_ERROR = 8 * UNIT_ROUNDOFF  # of a position error that is shortened: three squares, a root, a quotient, a product
 TANH_ERROR = 8 * UNIT_ROUNDOFF  # measured: 5.5 in onnxruntime 1.32, 4.6 in XLA, over all of [-12, 12]
 
+FORMAT_VALUE = "flytune-onnx-1"  # in every file that is written here
+
 
 def save_onnx(path: Path, policy: Policy) -> None:
     """Write a policy as ONNX, after a check that onnxruntime computes its actions; bytes depend on the policy alone.
@@ -162,7 +164,7 @@ def _model(policy: Policy) -> Any:
     about = {key: str(value) for key, value in policy.about.items()}
     if policy.dials:
         about[DIALS] = json.dumps({name: document.plain(policy.dials[name]) for name in sorted(policy.dials)})
-    facts = {FORMAT: "flytune-onnx-1", VERSION: metadata.version("flytune")}
+    facts = {FORMAT: FORMAT_VALUE, VERSION: metadata.version("flytune")}
     helper.set_model_props(model, about | CONVENTIONS | facts)
     return model
 

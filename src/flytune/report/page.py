@@ -31,6 +31,11 @@ from plotly.offline import get_plotlyjs
 from flytune.config import files
 
 
+def page_mark(template: str) -> bytes:
+    """What every page of a template contains near its beginning."""
+    return f'content="flytune {Path(template).stem}"'.encode()
+
+
 def write_page(path: Path, template: str, **values: Any) -> None:
     """Write a page, whole or not at all; an earlier file is replaced.
 
@@ -43,7 +48,7 @@ def write_page(path: Path, template: str, **values: Any) -> None:
 
 def render(template: str, **values: Any) -> str:
     """The page that a template of `templates/` makes of the values."""
-    return _environment().get_template(template).render(**values)
+    return _environment().get_template(template).render(kind=Path(template).stem, **values)
 
 
 @functools.cache

@@ -48,7 +48,9 @@ def facts(judgement: Judgement, speed_bound: float | None) -> dict[str, str]:
         "action": f"{number(action['rms'], 3)} RMS, changes by {number(action['total_variation'], 4)} per step",
         "step too small for overshoot": f"{small} trials",
         "flown": f"{judgement.trials} trials of {judgement.duration:g} s, starts {judgement.initial_conditions}, "
-        f"seed {judgement.seed}, vehicle {judgement.vehicle}, world {judgement.simulator}",
+        f"seed {judgement.seed}, vehicle {judgement.vehicle}"
+        + (f" (made for {judgement.made_for})" if judgement.made_for else "")
+        + f", world {judgement.simulator}",
     }
 
 

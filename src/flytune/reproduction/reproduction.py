@@ -8,7 +8,7 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-from flytune.config.files import make_folder, write_json, write_text
+from flytune.config.files import held, make_folder, write_json, write_text
 from flytune.reproduction.claims import judge_claims
 from flytune.reproduction.evidence import Evidence, gather_evidence
 from flytune.reproduction.figures import draw_figures
@@ -89,8 +89,9 @@ def reproduce(
         out = Path("runs") / f"reproduction-{trainer}{'-refined' if refined else ''}"
     study = Study(folder=Path(out), trainer=trainer, seeds=seeds, steps=steps, refined=refined)
     open_study(study)
-    train_all(study, on_progress=on_progress, on_message=on_message, workers=workers)
-    return _write(gather_evidence(study, on_message), started)
+    with held(study.folder):
+        train_all(study, on_progress=on_progress, on_message=on_message, workers=workers)
+        return _write(gather_evidence(study, on_message), started)
 
 
 def _write(evidence: Evidence, started: float) -> Reproduction:

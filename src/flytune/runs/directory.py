@@ -3,6 +3,7 @@
 import json
 import os
 import platform
+import shlex
 import subprocess
 import sys
 import time
@@ -17,21 +18,13 @@ import safetensors
 import safetensors.numpy
 
 from flytune.config import document, nested
-from flytune.config.files import make_folder, write_bytes, write_json, write_text
+from flytune.config.files import RUN_FILES, make_folder, write_bytes, write_json, write_text
 from flytune.control.policy import Policy, save_policy
 from flytune.errors import BadInput
 from flytune.task.files import load_task, write_task
 from flytune.task.task import Task
 
 CHECKPOINT = Path("checkpoint") / "train_state.safetensors"  # in a run directory
-
-
-def new_directory(name: str) -> Path:
-    """A directory under `runs` that does not exist yet: `name`, with a number behind it where that is taken."""
-    path, number = Path("runs") / name, 2
-    while path.exists():
-        path, number = path.with_name(f"{name}-{number}"), number + 1
-    return path
 
 
 class RunDirectory:
@@ -44,13 +37,21 @@ class RunDirectory:
         seed: of the training.
         resume: continue the training in the directory, instead of making a new one.
         packages: optional packages whose versions run.json records.
+        start: what the training starts from, for run.json; None for new weights.
 
     Raises:
         BadInput: the directory holds something else, or cannot be written; nothing was changed.
     """
 
     def __init__(
-        self, path: Path, task: Task, trainer: str, seed: int, resume: bool, packages: Sequence[str] = ()
+        self,
+        path: Path,
+        task: Task,
+        trainer: str,
+        seed: int,
+        resume: bool,
+        packages: Sequence[str] = (),
+        start: dict[str, Any] | None = None,
     ) -> None:
         self.path = path
         if path.exists() and not path.is_dir():
@@ -61,9 +62,13 @@ class RunDirectory:
             return
         if holds_run:
             raise BadInput(f"out: {path} already holds a run. Give another directory, or --resume to continue it.")
+        if taken := [name for name in (*RUN_FILES, "checkpoint") if os.path.lexists(path / name)]:
+            raise BadInput(
+                f"out: {path} is no run and holds {taken[0]}, which is not replaced. Give another directory."
+            )
         make_folder(path)
         write_text(path / "task.toml", write_task(task))
-        write_json(path / "run.json", _facts(task, trainer, seed, packages))
+        write_json(path / "run.json", _facts(task, trainer, seed, packages) | {"from": start})
 
     def _check_same(self, task: Task, trainer: str, seed: int, holds_run: bool) -> None:
         if not holds_run:
@@ -95,27 +100,8 @@ class RunDirectory:
         write_text(self.path / "metrics.jsonl", "".join(json.dumps(row) + "\n" for row in rows))
 
     def resume(self, fresh: Any) -> tuple[Any, list[dict[str, Any]]]:
-        """The training state and the metrics of the checkpoint; `fresh` is a state of the same structure.
-
-        Raises:
-            BadInput: the checkpoint is damaged, or of another version of flytune.
-        """
-        path = self.path / CHECKPOINT
-        try:
-            with safetensors.safe_open(path, framework="numpy") as file:
-                stored = [file.get_tensor(name) for name in sorted(file.keys())]
-                rows = json.loads((file.metadata() or {})["rows"])
-        except (safetensors.SafetensorError, OSError, KeyError, ValueError) as error:
-            raise BadInput(f"resume: {path} is damaged ({error}). Train again into another directory.") from None
-        leaves, structure = jax.tree.flatten(fresh)
-        shapes = [np.shape(_raw(leaf)) for leaf in leaves]
-        if shapes != [value.shape for value in stored]:
-            raise BadInput(f"resume: {path} is of another version of flytune. Train again into another directory.")
-        restored = [
-            jax.random.wrap_key_data(value) if _is_key(leaf) else jax.numpy.asarray(value)
-            for leaf, value in zip(leaves, stored, strict=True)
-        ]
-        return jax.tree.unflatten(structure, restored), rows
+        """The training state and the metrics of the checkpoint, see `read_checkpoint`."""
+        return read_checkpoint(self.path, fresh)
 
     def finish(self, policy: Policy, last_policy: Policy, last: dict[str, Any]) -> None:
         """Write the policies, and run.json as of a complete training; `last` is the last row of the metrics."""
@@ -125,6 +111,30 @@ class RunDirectory:
         write_json(self.path / "run.json", read_facts(self.path) | finished)
 
 
+def read_checkpoint(directory: Path, fresh: Any, field: str = "resume") -> tuple[Any, list[dict[str, Any]]]:
+    """The training state and the metrics of a run's checkpoint; `fresh` is a state of this structure, or its shapes.
+
+    Raises:
+        BadInput: the checkpoint is damaged, or of another version of flytune.
+    """
+    path = directory / CHECKPOINT
+    try:
+        with safetensors.safe_open(path, framework="numpy") as file:
+            stored = [file.get_tensor(name) for name in sorted(file.keys())]
+            rows = json.loads((file.metadata() or {})["rows"])
+    except (safetensors.SafetensorError, OSError, KeyError, ValueError) as error:
+        raise BadInput(f"{field}: {path} is damaged ({error}). Train again into another directory.") from None
+    leaves, structure = jax.tree.flatten(fresh)
+    shapes = [jax.eval_shape(_raw, leaf).shape for leaf in leaves]
+    if shapes != [value.shape for value in stored]:
+        raise BadInput(f"{field}: {path} is of another version of flytune. Train again into another directory.")
+    restored = [
+        jax.random.wrap_key_data(value) if _is_key(leaf) else jax.numpy.asarray(value)
+        for leaf, value in zip(leaves, stored, strict=True)
+    ]
+    return jax.tree.unflatten(structure, restored), rows
+
+
 def has_checkpoint(directory: Path) -> bool:
     """Whether a directory holds the checkpoint of a training."""
     return (directory / CHECKPOINT).exists()
@@ -132,7 +142,8 @@ def has_checkpoint(directory: Path) -> bool:
 
 def resume_command(path: Path, trainer: str, seed: int) -> str:
     """The command that continues an interrupted training."""
-    return f"flytune train {path / 'task.toml'} --trainer {trainer} --seed {seed} --out {path} --resume"
+    words = ["--trainer", trainer, "--seed", str(seed), "--out", str(path), "--resume"]
+    return shlex.join(["flytune", "train", str(path / "task.toml"), *words])
 
 
 def read_facts(directory: Path) -> dict[str, Any]:

@@ -9,7 +9,7 @@ from typing import Any
 
 import jax
 
-from flytune.config import document
+from flytune.config import document, nested
 from flytune.control.classical import CLASSICAL, classical_controller
 from flytune.control.controller import Controller
 from flytune.control.policy import Policy, load_policy
@@ -39,6 +39,15 @@ class FoundController:
     task: Task  # the one asked for, else the one it was trained for, else the baseline
     metrics: list[dict[str, Any]] | None = None  # of its training, one row per update; None where it has none
     about: dict[str, str] = dataclasses.field(default_factory=dict)  # facts for a reader
+    trained: Task | None = None  # the task of its training; None where it says none, or was not trained
+
+    def made_for(self, task: Task) -> str:
+        """The vehicle of its training, where that is another one than the task has; else nothing."""
+        if self.trained is None:
+            return ""
+        own, flown = self.trained.vehicle, task.vehicle
+        other = nested.first_difference(document.plain(own), document.plain(flown))
+        return "" if other is None else own.name if own.name != flown.name else f"{own.name} with another {other}"
 
     def initial_memory(self) -> Any:
         """The memory of the controller before its first observation."""
@@ -170,8 +179,9 @@ def _from_file(name: str, path: Path, wanted: Task | None, **given: Any) -> Foun
     policy = READERS.get(path.suffix, load_policy)(path, **given)
     about = {key: str(value) for key, value in policy.about.items() if key != "task_toml"}
     text = policy.about.get("task_toml")
-    task = wanted or (read_task_text(text, name) if text else load_task("baseline"))
-    return FoundController(name=name, controller=policy, task=task, about=about)
+    trained = read_task_text(text, name) if text else None
+    task = wanted or trained or load_task("baseline")
+    return FoundController(name=name, controller=policy, task=task, about=about, trained=trained)
 
 
 def _shipped(name: str, wanted: Task | None) -> FoundController:
@@ -185,7 +195,7 @@ def _from_run(name: str, path: Path, wanted: Task | None) -> FoundController:
     facts = read_facts(path)
     if not (path / "policy.safetensors").exists():
         command = resume_command(path, facts["trainer"], facts["seed"])
-        remedy = f"Continue it with: {command}" if has_checkpoint(path) else "Train it again."
+        remedy = f"Continue it with: {command}" if has_checkpoint(path) else "Train again into another directory."
         raise BadInput(f"{name}: its training has not ended. {remedy}")
     policy = load_policy(path / "policy.safetensors")
     about = {
@@ -198,8 +208,10 @@ def _from_run(name: str, path: Path, wanted: Task | None) -> FoundController:
         "started": facts["time"],
     }
     metrics = _read_metrics(path / "metrics.jsonl")
-    task = wanted or load_task(path / "task.toml")
-    return FoundController(name=name, controller=policy, task=task, metrics=metrics, about=about)
+    trained = load_task(path / "task.toml")
+    return FoundController(
+        name=name, controller=policy, task=wanted or trained, metrics=metrics, about=about, trained=trained
+    )
 
 
 def _read_metrics(path: Path) -> list[dict[str, Any]] | None:

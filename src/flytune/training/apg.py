@@ -22,7 +22,7 @@ from flytune.kernels.dense import Actor
 from flytune.kernels.programs import program
 from flytune.simulation.environment import Episode, Outcome
 from flytune.simulation.rollout import Draw, reset_all, rollout, split_keys
-from flytune.task.observation import SIZE, input_scale
+from flytune.task.observation import input_scale
 from flytune.task.task import Task
 from flytune.task.training_settings import ApgSettings
 from flytune.training.threads import PARTS, in_threads
@@ -34,6 +34,7 @@ from flytune.training.update import (
     rollout_sums,
     turned,
 )
+from flytune.training.warm_start import Critic, rescaled
 
 
 @pytree
@@ -99,16 +100,15 @@ def barrier(margin: Float[Array, ""], settings: ApgSettings) -> Float[Array, ""]
     return settings.barrier_weight * jnp.maximum(settings.barrier_margin - margin, 0.0) ** 2
 
 
-def warm_start(settings: ApgSettings, train_state: TrainState, policy: Policy) -> TrainState:
-    """The training state before the first update, with an actor that flies as `policy` does.
+def warm_start(
+    settings: ApgSettings, train_state: TrainState, policy: Policy, critic: Critic | None = None
+) -> TrainState:
+    """The training state before the first update, with an actor that flies as `policy` does; there is no critic.
 
     The policy may have been trained on other multiples of the observation; the first layer makes up for that.
     """
-    first, *others = policy.actor.weights
-    ratio = jnp.ones(len(first)).at[:SIZE].set(policy.input_scale / input_scale(settings.input_scale))
-    actor = dataclasses.replace(policy.actor, weights=(first * ratio[:, None], *others))
-    actor = jax.tree.map(jnp.array, actor)  # copies, because an update donates the memory of its state
-    return dataclasses.replace(train_state, actor=actor, ema=jax.tree.map(jnp.array, actor))
+    actor, ema = (rescaled(policy.actor, policy.input_scale, settings.input_scale) for _ in range(2))
+    return dataclasses.replace(train_state, actor=actor, ema=ema)
 
 
 def update(task: Task, settings: ApgSettings, train_state: TrainState) -> tuple[TrainState, dict[str, Any]]:

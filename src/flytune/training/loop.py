@@ -2,6 +2,7 @@
 
 import contextlib
 import dataclasses
+import os
 import signal
 import threading
 import time
@@ -12,6 +13,7 @@ from typing import Any
 
 import jax
 
+from flytune.config.files import held, make_folder
 from flytune.control.policy import Policy
 from flytune.errors import BadInput, Interrupted, require
 from flytune.runs.directory import RunDirectory, resume_command
@@ -21,6 +23,7 @@ from flytune.training.progress import Clock, Progress
 from flytune.training.tensorboard import EventLog
 from flytune.training.trainer import DEFAULT_TRAINER, find_trainer
 from flytune.training.update import metrics_row
+from flytune.training.warm_start import WarmStart, as_warm_start, check_ended
 
 CHECKPOINT_INTERVAL = 30.0  # s between checkpoints
 
@@ -49,7 +52,7 @@ def train(
     seed: int = 0,
     out: Path | None = None,
     resume: bool = False,
-    warm_start: Policy | None = None,
+    warm_start: str | Policy | WarmStart | None = None,
     tensorboard: bool = False,
     on_progress: Callable[[Progress], None] | None = None,
 ) -> Run:
@@ -65,7 +68,9 @@ def train(
         seed: of the weights, the episodes and the noise; 0 or more.
         out: run directory to write; nothing is written where None.
         resume: continue from the checkpoint in `out`.
-        warm_start: a policy to start from, for a trainer that supports it (`apg`); new weights where None.
+        warm_start: a policy to start from, or the name of one (a run directory, a file, a policy that ships), for a
+            trainer that supports it (`apg`, `ppo`); new weights where None. The name of a run of `ppo` also gives its
+            critic to `ppo`.
         tensorboard: write TensorBoard's event files beside the metrics in `out`.
         on_progress: called after every update.
 
@@ -77,19 +82,23 @@ def train(
     method = find_trainer(trainer)
     if not 0 <= seed < 2**32:
         raise BadInput(f"seed: {seed} is not allowed. Allowed: a whole number, 0 to {2**32 - 1}.")
-    if warm_start is not None:
-        method.check_warm_start(task, warm_start)
     method.check(task)
+    start = None if warm_start is None else as_warm_start(warm_start)
+    if start is not None:
+        method.check_warm_start(task, start.policy, start.field)
+    if resume and out is not None:
+        check_ended(out, task, trainer, seed)
     if tensorboard:
         require("tensorboard", "tensorboard")
         if out is None:
             raise BadInput("tensorboard: needs out, the run directory to write its event files into.")
 
-    with _deferred_interrupt() as interrupted:
-        directory = RunDirectory(out, task, trainer, seed, resume, method.packages) if out is not None else None
+    with _deferred_interrupt() as interrupted, _held(out, resume):
+        facts = None if start is None else start.facts
+        directory = RunDirectory(out, task, trainer, seed, resume, method.packages, facts) if out is not None else None
         train_state, rows = method.start(task, jax.random.key(seed)), []
-        if warm_start is not None:
-            train_state = method.warm_start(task, train_state, warm_start)
+        if start is not None:
+            train_state = method.warm_start(task, train_state, start.policy, start.critic)
         if directory is not None and resume:
             train_state, rows = directory.resume(train_state)
         settings = method.settings(task)
@@ -135,6 +144,14 @@ def train(
     if directory is not None:
         directory.finish(run.policy, run.last_policy, rows[-1])
     return run
+
+
+def _held(out: Path | None, resume: bool) -> contextlib.AbstractContextManager[None]:
+    """Holds a run directory, which may be new; what cannot be one is left to `RunDirectory` to refuse."""
+    if out is None or (not os.path.isdir(out) and (resume or os.path.lexists(out))):
+        return contextlib.nullcontext()
+    make_folder(out)
+    return held(out)
 
 
 @contextlib.contextmanager

@@ -39,6 +39,7 @@ from flytune.training.update import (
     rollout_sums,
     turned,
 )
+from flytune.training.warm_start import Critic, rescaled
 
 _busy_cores = BusyCores()
 
@@ -103,6 +104,22 @@ def start(task: Task, settings: PpoSettings, key: Array) -> TrainState:
         key=key,
         updates=jnp.zeros((), jnp.int32),
     )
+
+
+def warm_start(
+    settings: PpoSettings, train_state: TrainState, policy: Policy, critic: Critic | None = None
+) -> TrainState:
+    """The training state before the first update, with an actor whose mean action is that of `policy`.
+
+    The critic is `critic`, or has new weights where that is None. The spread of the actions is that of the settings,
+    `initial_log_std`, and the optimiser begins anew.
+    """
+    actor, ema = (rescaled(policy.actor, policy.input_scale, settings.input_scale) for _ in range(2))
+    parameters = dataclasses.replace(train_state.parameters, actor=actor)
+    if critic is not None:
+        network = rescaled(critic.network, critic.input_scale, settings.input_scale)
+        parameters = dataclasses.replace(parameters, critic=network)
+    return dataclasses.replace(train_state, parameters=parameters, ema=ema)
 
 
 def update(task: Task, settings: PpoSettings, train_state: TrainState) -> tuple[TrainState, dict[str, Any]]:

@@ -212,7 +212,7 @@ class _Model:
             number = int(train_state.updates) + 1
             raise Diverged(
                 f"training: the weights stop being finite in update {number} ({number * samples} environment steps). "
-                "A smaller learning_rate, or smaller weights in the reward, may help."
+                "A smaller learning rate (--set ppo.learning_rate=VALUE), or smaller weights in the reward, may help."
             ) from None
         logged = self.model.logger.name_to_value
         steps = dataclasses.replace(transitions[0], report=np.stack([each.report for each in transitions]))

@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from flytune.control.policy import Policy
     from flytune.task.task import Task
     from flytune.task.training_settings import TrainerSettings
+    from flytune.training.warm_start import Critic
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -30,7 +31,7 @@ class Trainer:
 
     Its module offers the pure functions `start(task, settings, key)`, `update(task, settings, train_state)`,
     `policy(settings, train_state)`, `last_policy(settings, train_state)`, and where it is supported
-    `warm_start(settings, train_state, policy)`. The training state is a JAX pytree of the module's own.
+    `warm_start(settings, train_state, policy, critic)`. The training state is a JAX pytree of the module's own.
     """
 
     name: str
@@ -43,6 +44,7 @@ class Trainer:
     own_starts: bool = False  # whether its settings, not the task, say where training episodes begin
     supports_dials: bool = False  # whether it can train a task with dials
     supports_warm_start: bool = False  # whether a training can start from the weights of a policy
+    tuning_goes_on: bool = False  # whether each training of a tuning starts from the policy before
 
     def settings(self, task: Task) -> TrainerSettings:
         """The settings of this trainer in a task."""
@@ -137,33 +139,66 @@ class Trainer:
         """The policy of the last update."""
         return _completed(self._algorithm().last_policy(self.settings(task), train_state), task)
 
-    def warm_start(self, task: Task, train_state: Any, policy: Policy) -> Any:
+    def warm_start(self, task: Task, train_state: Any, policy: Policy, critic: Critic | None = None) -> Any:
         """The training state before the first update, with an actor that gives the actions of `policy`.
+
+        A trainer with a critic starts from `critic`, or from new weights where that is None.
 
         Raises:
             BadInput: see `check_warm_start`.
         """
         self.check_warm_start(task, policy)
-        return self._algorithm().warm_start(self.settings(task), train_state, policy)
+        return self._algorithm().warm_start(self.settings(task), train_state, policy, critic)
 
-    def check_warm_start(self, task: Task, policy: Policy) -> None:
+    def check_warm_start(self, task: Task, policy: Policy, field: str = "warm_start") -> None:
         """Refuse a warm start that is not possible, before anything is written.
 
         Raises:
-            BadInput: the trainer has no warm start, or its policies have other layers or another squash.
+            BadInput: the trainer has no warm start, or its policies have other inputs, layers, bounds or another squash.
         """
-        import jax
+        from flytune.config import document
 
         if not self.supports_warm_start:
             able = ", ".join(trainer_names(warm_start=True))
-            raise BadInput(f"warm_start: trainer {self.name} cannot start from a policy. Allowed: trainer {able}.")
-        own = jax.eval_shape(lambda key: self.policy(task, self.start(task, key)), jax.random.key(0))
-        given, allowed = ([weight.shape for weight in each.actor.weights] for each in (policy, own))
-        if (given, policy.squash) != (allowed, own.squash):
+            raise BadInput(f"{field}: trainer {self.name} cannot start from a policy. Allowed: trainer {able}.")
+        inputs, wanted = (
+            {name: document.plain(each) for name, each in given.items()} for given in (policy.inputs, task.input)
+        )
+        if inputs != wanted:
+            remedy = "Give the policy at a setting, NAME@DIAL=VALUE." if policy.dials and not task.dial else (
+                "Give a policy that was trained on a task with the same [input]."
+            )  # fmt: skip
             raise BadInput(
-                f"warm_start: a policy with layers {given} and squash {policy.squash} is not allowed. "
-                f"Allowed: layers {allowed} and squash {own.squash}, as trainer {self.name} makes them for this task."
+                f"{field}: a policy with the inputs {', '.join(inputs) or 'none'} beside the observation is not "
+                f"allowed. Allowed: those of the task ({', '.join(wanted) or 'none'}). {remedy}"
             )
+        if policy.bounds is not None:
+            raise BadInput(
+                f"{field}: a policy that clips its observations, as one that was trained behind VecNormalize, is not "
+                "allowed. Allowed: a policy of the observations as they are."
+            )
+        own = self._shape(task)
+        given, allowed = ([weight.shape for weight in each.actor.weights] for each in (policy, own))
+        if (given, policy.squash) == (allowed, own.squash):
+            return
+        if given != allowed:
+            hidden = [shape[1] for shape in given[:-1]]
+            remedy = f"Add --set '{self.settings_field}.hidden={hidden}'."
+        else:
+            able = [each.name for each in TRAINERS.values() if each.supports_warm_start]
+            fits = [name for name in able if TRAINERS[name]._shape(task).squash == policy.squash]
+            remedy = f"Add --trainer {' or '.join(fits)}."
+        raise BadInput(
+            f"{field}: a policy with layers {given} and squash {policy.squash} is not allowed. "
+            f"Allowed: layers {allowed} and squash {own.squash}, as trainer {self.name} makes them for this task. "
+            f"{remedy}"
+        )
+
+    def _shape(self, task: Task) -> Policy:
+        """The shapes of the policies that this trainer makes for a task."""
+        import jax
+
+        return jax.eval_shape(lambda key: self.policy(task, self.start(task, key)), jax.random.key(0))
 
     def _algorithm(self) -> Any:
         return import_module(self.module)
@@ -174,17 +209,20 @@ def _completed(policy: Policy, task: Task) -> Policy:
 
     That is the distance of the farthest start, of the training or of an evaluation.
     """
+    import jax
+
     from flytune.task.initial_state import EVALUATION_INITIAL_STATES
     from flytune.task.situation import POSITION_BAND
 
     setting = {name: float(dial.default) for name, dial in task.dial.items()}
-    starts = (task.initial_state, *EVALUATION_INITIAL_STATES.values())
+    with jax.ensure_compile_time_eval():  # also where only the shapes of a policy are asked for
+        farthest = max(float(each.farthest()) for each in (task.initial_state, *EVALUATION_INITIAL_STATES.values()))
     return dataclasses.replace(
         policy,
         dials=task.dial,
         inputs=task.input,
         setting=setting,
-        error_limit=round(max(float(each.farthest()) for each in starts) + POSITION_BAND, 3),
+        error_limit=round(farthest + POSITION_BAND, 3),
     )
 
 
@@ -199,6 +237,7 @@ TRAINERS = {
             own_starts=True,
             supports_dials=True,
             supports_warm_start=True,
+            tuning_goes_on=True,
         ),
         Trainer(
             name="ppo",
@@ -206,6 +245,7 @@ TRAINERS = {
             module="flytune.training.ppo",
             settings_field="ppo",
             supports_dials=True,
+            supports_warm_start=True,
         ),
         Trainer(
             name="sb3",
@@ -220,12 +260,16 @@ TRAINERS = {
 }
 
 
-def trainer_names(*, every_task: bool = False, warm_start: bool = False) -> tuple[str, ...]:
-    """The names of all trainers, or of those that can train every task, or that support a warm start."""
+def trainer_names(
+    *, every_task: bool = False, warm_start: bool = False, tuning_goes_on: bool = False
+) -> tuple[str, ...]:
+    """The names of all trainers, or of those that can train every task, support a warm start, or use it in tuning."""
     return tuple(
         name
         for name, trainer in TRAINERS.items()
-        if not (every_task and trainer.missing_settings) and (trainer.supports_warm_start or not warm_start)
+        if not (every_task and trainer.missing_settings)
+        and (trainer.supports_warm_start or not warm_start)
+        and (trainer.tuning_goes_on or not tuning_goes_on)
     )
 
 

@@ -155,4 +155,7 @@ def _remedy(row: dict[str, Any]) -> str:
             "Nothing has been learned yet, so that it comes from the task. A smaller apg.window helps, since gradients "
             "grow with the number of steps; or smaller values of sharpness, wide and narrow in the reward."
         )
-    return "A smaller learning_rate helps; that of the presets is a start."
+    return (
+        "A smaller learning rate (--set apg.learning_rate=VALUE or ppo.learning_rate=VALUE) helps; that of the presets "
+        "is a start."
+    )

@@ -133,7 +133,7 @@ class Tuner:
         """
         task = self.task_of(planned)
         initial = self.start.initial if planned.parent is None else None
-        if find_trainer(self.trainer).supports_warm_start and planned.parent is not None:
+        if find_trainer(self.trainer).tuning_goes_on and planned.parent is not None:
             initial = self._policy(planned.parent)
         seconds = 0.0
         try:

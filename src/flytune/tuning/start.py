@@ -96,7 +96,7 @@ def find_start(requirement: Requirement, wanted: str | None, edits: Mapping[str,
             if requirement.misses(response) or any(field.startswith("reward.") for field in other):
                 policy = record = judgement = None
     same_vehicle = not any(field.startswith("vehicle.") for field in other)
-    warm = policy is None and same_vehicle and find_trainer(trainer).supports_warm_start
+    warm = policy is None and same_vehicle and find_trainer(trainer).tuning_goes_on
     task = dataclasses.replace(tasks[name], name=f"{tasks[name].name}-tuned-{requirement.settling_time:g}s")
     return Start(
         name=name,
@@ -170,6 +170,6 @@ def _shipped(name: str, task: Task, trainer: str) -> tuple[Path, Path] | None:
     if name not in KNOWN:
         return None
     method, known = find_trainer(trainer), shipped_name(name, trainer)
-    if method.supports_warm_start and method.settings(task).hidden != method.settings(load_task(name)).hidden:
+    if method.tuning_goes_on and method.settings(task).hidden != method.settings(load_task(name)).hidden:
         return None
     return shipped_files(known) if known in shipped_names() else None

@@ -1,14 +1,17 @@
 """The call that tunes: from a wanted step response to a policy, with the run directory and the page of the tuning."""
 
+import contextlib
+import dataclasses
 import os
 import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from flytune.config.files import RUN_FILES, held, make_folder
 from flytune.errors import BadInput, Interrupted
 from flytune.report.tuning import write_tuning
-from flytune.runs.directory import new_directory
+from flytune.runs.naming import new_directory, run_name
 from flytune.training.progress import Progress
 from flytune.training.trainer import DEFAULT_TRAINER, find_trainer
 from flytune.tuning.asked import OVERSHOOT, PERCENTILE, PerAxis, make_requirement
@@ -71,27 +74,41 @@ def tune(
         Diverged: numbers became infinite in the first training.
         Interrupted: Ctrl-C; the results so far are in the directory.
     """
-    began = time.monotonic()
     requirement = make_requirement(
         settling_time, overshoot, error, at_most=at_most, tolerance=tolerance, axis=axis, percentile=percentile
     )
     if rules is None or isinstance(rules, str | Path):
         rules = load_rules(rules)
-    directory = _directory(out, requirement, resume)
     method = find_trainer(trainer, every_task=True)
     method.check_edits(edits or {})
     if not 1 <= most_iterations <= 100:
         raise BadInput(f"iterations: {most_iterations} is not allowed. Allowed: a whole number, 1 to 100.")
     if not 0 <= seed < 2**32:
         raise BadInput(f"seed: {seed} is not allowed. Allowed: a whole number, 0 to {2**32 - 1}.")
-    say = on_message or (lambda _: None)
-    tuner = Tuner(
-        requirement=requirement, rules=rules, out=directory, task=task, edits=dict(edits or {}), seed=seed,
-        trainer=trainer, most_iterations=most_iterations, on_message=say, on_progress=on_progress,
-    )  # fmt: skip
-    method.check(tuner.start.task)  # before anything is written
-    if resume:
-        tuner.history.read()
+    changes = dict(edits or {})
+    asked = {**dataclasses.asdict(requirement), "task": task, "edits": changes, "trainer": trainer, "seed": seed}
+    with _directory(out, requirement, asked, resume) as directory:
+        tuner = Tuner(
+            requirement=requirement, rules=rules, out=directory, task=task, edits=changes, seed=seed, trainer=trainer,
+            most_iterations=most_iterations, on_message=on_message or (lambda _: None), on_progress=on_progress,
+        )  # fmt: skip
+        method.check(tuner.start.task)  # before anything is written
+        if resume:
+            tuner.history.read()
+        make_folder(directory)
+        with held(directory):
+            if not resume:
+                _check_new(directory)  # again, since another process may have been faster
+            return _run(tuner)
+
+
+def _run(tuner: Tuner) -> Tuning:
+    """The result of a tuning, with its page.
+
+    Raises:
+        Interrupted: Ctrl-C.
+    """
+    began, directory = time.monotonic(), tuner.out
     try:
         result = tuner.run()
     except (Interrupted, KeyboardInterrupt):
@@ -102,12 +119,14 @@ def tune(
     write_tuning(directory / "report.html", result.to_dict(), tuner.validated.get(result.best))
     trainings = sum(each.seconds > 0 for each in result.iterations)
     outcome = f"requirement {'met' if result.met else 'not met'}; the best policy is that of iteration {result.best}"
-    say(line("result", f"{outcome}, after {trainings} trainings and {time.monotonic() - began:.0f} s"))
+    tuner.on_message(line("result", f"{outcome}, after {trainings} trainings and {time.monotonic() - began:.0f} s"))
     return result
 
 
-def _directory(out: str | Path | None, requirement: Requirement, resume: bool) -> Path:
-    """The directory to write.
+def _directory(
+    out: str | Path | None, requirement: Requirement, asked: Mapping[str, Any], resume: bool
+) -> contextlib.AbstractContextManager[Path]:
+    """The directory to write; a new one has a name that differs with what is asked.
 
     Raises:
         BadInput: it is a file, or it holds a tuning or a run; or there is none to resume.
@@ -115,11 +134,28 @@ def _directory(out: str | Path | None, requirement: Requirement, resume: bool) -
     if out is None:
         if resume:
             raise BadInput("resume: needs --out DIR, the directory of the tuning to continue.")
-        return new_directory(f"tune-{requirement.settling_time:g}s")
+        usual = {**vars(make_requirement(requirement.settling_time)), "task": None, "edits": {}}
+        usual |= {"trainer": DEFAULT_TRAINER, "seed": 0}
+        changes = {name: value for name, value in asked.items() if value != usual[name]}
+        return new_directory(run_name(f"tune-{requirement.settling_time:g}s", changes))
     directory = Path(out)
     # not Path.exists, which raises where a name is too long
     if os.path.exists(directory) and not os.path.isdir(directory):
         raise BadInput(f"out: {directory} is a file. Give a directory that does not exist yet.")
-    if not resume and any(os.path.exists(directory / name) for name in ("tune.json", "run.json", "iterations")):
+    if not resume:
+        _check_new(directory)
+    return contextlib.nullcontext(directory)
+
+
+def _check_new(directory: Path) -> None:
+    """Refuse a directory that holds a tuning or a run.
+
+    Raises:
+        BadInput: it does.
+    """
+    if any(os.path.exists(directory / name) for name in ("tune.json", "run.json", "iterations")):
         raise BadInput(f"out: {directory} already holds a tuning or a run. Give another directory, or --resume.")
-    return directory
+    if taken := [name for name in (*RUN_FILES, "report.html") if os.path.lexists(directory / name)]:
+        raise BadInput(
+            f"out: {directory} is no tuning and holds {taken[0]}, which is not replaced. Give another directory."
+        )
