@@ -102,6 +102,7 @@ def test_two_values_of_one_path_are_refused():
     with pytest.raises(BadInput, match=r"^a\.b: has two values, 1 and 2\. Give one of them\.$"):
         assignments(("a.b=1", "c=3", "a.b=2"))
     assert assignments(("a.b=1", "a.b=1")) == {"a.b": 1}
+    assert list(assignments(("a.b=nan",))) == ["a.b"]
 
 
 def test_an_option_that_is_given_twice_counts_as_given_last():
