@@ -9,6 +9,8 @@ from types import SimpleNamespace
 import pytest
 
 from flytune.cli.main import main, make_app
+from flytune.cli.options import assignments
+from flytune.errors import BadInput
 
 OPTIONS = {
     "train": "TASK --trainer --seed --steps --out --set --from --resume --tensorboard",
@@ -97,6 +99,13 @@ def test_assignments_may_follow_one_option_or_repeat_it():
     assert arguments == ("baseline",)
     assert options.edits == ("a=1", "b=[2, 3]", "c=x y")
     assert options.seed == 4
+
+
+def test_two_values_of_one_path_are_refused():
+    with pytest.raises(BadInput, match=r"^a\.b: has two values, 1 and 2\. Give one of them\.$"):
+        assignments(("a.b=1", "c=3", "a.b=2"))
+    assert assignments(("a.b=1", "a.b=1")) == {"a.b": 1}
+    assert list(assignments(("a.b=nan",))) == ["a.b"]
 
 
 def test_an_option_that_is_given_twice_counts_as_given_last():

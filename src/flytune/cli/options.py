@@ -120,7 +120,7 @@ def assignments(texts: Sequence[str]) -> dict[str, Any]:
 
     values: dict[str, Any] = {}
     for path, value in map(parse_assignment, texts):
-        if values.setdefault(path, value) != value:
+        if repr(values.setdefault(path, value)) != repr(value):  # nan is not equal to itself
             raise BadInput(f"{path}: has two values, {values[path]} and {value}. Give one of them.")
     return values
 

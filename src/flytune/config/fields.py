@@ -12,7 +12,7 @@ from pydantic import AfterValidator, AllowInfNan, Strict
 
 from flytune.config.formula import Formula
 
-LARGEST, SMALLEST = 1e30, 1e-30  # what squares and quotients of single precision still hold, with room
+LARGEST, SMALLEST = 3e38, 1.2e-38  # of single precision, without subnormal numbers
 
 
 def _single(value: float) -> float:
