@@ -275,7 +275,15 @@ def _edited(data: dict[str, Any], path: str, value: Any) -> dict[str, Any]:
     return data
 
 
-FOLLOWING = ("target", "noise", "reward", "termination", "vehicle", "duration")  # parts whose fields may follow a dial
+FOLLOWING = (
+    "target",
+    "noise",
+    "reward",
+    "termination",
+    "vehicle",
+    "duration",
+    "horizon",
+)  # parts whose fields may follow a dial
 MOST_DIALS = 4  # all their settings together are checked
 CHECKED = {1: 9, 2: 5, 3: 4, 4: 3}  # number of dials -> settings of each at which a task is checked
 
@@ -330,7 +338,7 @@ def _at_default(task: Task, where: str) -> Task:
     if not task.dial:
         return task
     prefix = f"{where}: " if where else ""
-    settings = itertools.product(*(dial.grid(CHECKED[len(task.dial)]) for dial in task.dial.values()))
+    settings = itertools.product(*(dial.trained_grid(CHECKED[len(task.dial)]) for dial in task.dial.values()))
     default = {name: dial.default for name, dial in task.dial.items()}
     for values in settings:
         _at(task, dict(zip(task.dial, values, strict=True)), prefix)
@@ -344,7 +352,8 @@ def _at(task: Task, setting: Setting, prefix: str = "") -> Task:
     for path, formula in task.follow.items():
         if nested.look_up(plain, path) is None or isinstance(nested.look_up(plain, path), dict):
             raise BadInput(f"{prefix}follow.{path}: the task has no such number. Allowed: the path of a field.")
-        plain = nested.edit(plain, path, _value(formula, setting, f"{prefix}follow.{path}"))
+        value = _value(formula, setting, f"{prefix}follow.{path}")
+        plain = nested.edit(plain, path, math.ceil(value) if path == "horizon" else value)  # of whole steps
     for name, each in task.input.items():
         _value(each.value, setting, f"{prefix}input.{name}.value")
     rest = {key: value for key, value in plain.items() if key not in ("dial", "follow", "input")}
