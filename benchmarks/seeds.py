@@ -11,6 +11,7 @@ import time
 from functools import partial
 
 os.environ.setdefault("XLA_FLAGS", "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1")
+os.environ["FLYTUNE_CORES"] = "1"
 
 import jax
 

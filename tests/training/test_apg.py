@@ -51,6 +51,15 @@ def test_the_barrier_costs_nothing_inside_its_margin_and_grows_as_a_square_beyon
     np.testing.assert_allclose(costs, [0.0, 0.0, 0.3, 1.2], atol=1e-6)
 
 
+def test_beyond_its_knee_the_barrier_goes_on_as_the_tangent_of_the_square(small_task):
+    settings = dataclasses.replace(small_task.apg, barrier_weight=30.0, barrier_margin=0.1, barrier_knee=0.2)
+    value = jax.value_and_grad(apg.barrier)
+    # depth 0.1 and 0.2: 30 * 0.1^2 and 30 * 0.2^2; then 30 * 2 * 0.2 = 12 for each unit of depth
+    costs, slopes = zip(*(value(margin, settings) for margin in (0.0, -0.1, -0.6, -7.1)), strict=True)
+    np.testing.assert_allclose(costs, [0.3, 1.2, 1.2 + 0.5 * 12, 1.2 + 7 * 12], rtol=1e-5)
+    np.testing.assert_allclose([slopes[0], *slopes[2:]], [-6.0, -12.0, -12.0], rtol=1e-5)
+
+
 def flying(speed):
     return jnp.asarray(speed, jnp.float32), jnp.zeros(()), jnp.zeros(())
 
@@ -63,6 +72,17 @@ def test_an_episode_ends_where_a_bound_is_passed_by_more_than_the_termination_sl
     moved, outcome = environment.step(small_task, dataclasses.replace(episode, state=fast), jnp.zeros(4))
     assert bool(outcome.terminated)
     assert bool(environment.with_slack(small_task, moved, outcome, slack).terminated) is over
+
+
+@pytest.mark.parametrize(("share", "over"), [(0.5, True), (1.0, False)])
+def test_a_termination_may_have_a_slack_of_its_own(small_task, share, over):
+    bounds = {**small_task.termination, "speed": dataclasses.replace(small_task.termination["speed"], slack=share)}
+    task = dataclasses.replace(small_task, termination=bounds)
+    episode = environment.reset(task, jax.random.key(0))
+    fast = dataclasses.replace(episode.state, velocity=flying(1.5 * task.speed_bound))
+    moved, outcome = environment.step(task, dataclasses.replace(episode, state=fast), jnp.zeros(4))
+    # a margin of -0.5, and a slack of 0.6 times the share
+    assert bool(environment.with_slack(task, moved, outcome, 0.6).terminated) is over
 
 
 def test_an_episode_within_the_termination_slack_still_ends_at_its_horizon(small_task):

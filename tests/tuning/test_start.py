@@ -89,7 +89,7 @@ def test_the_task_with_a_dial_is_tuned_by_its_dial_and_another_with_a_dial_is_re
 
 
 def test_a_requirement_that_a_bound_of_the_user_forbids_is_refused_though_the_dial_would_meet_it():
-    # the dial turns the yaw in 0.24 s, but at 100 deg/s the median trial takes longer
+    # the dial turns the yaw in 0.27 s, but at 100 deg/s the median trial takes longer
     edits = {"termination.body_rate.bound_deg_per_s": 100.0}
     with pytest.raises(BadInput, match="the body rate bound of 100 deg/s you have set"):
         find_start(make_requirement(0.4, axis="yaw", at_most=True), None, edits, "apg")

@@ -119,7 +119,8 @@ class Policy:
         """
         first, *others = self.actor.weights
         bias, *biases = self.actor.biases
-        weight, bias, further = np.array(first[:SIZE]), np.array(bias), np.asarray(first[SIZE:])
+        first, bias = np.array(first), np.array(bias)  # of NumPy, whose slices compile nothing
+        weight, further = first[:SIZE], first[SIZE:]
         for name in sorted(self.inputs):
             each = self.inputs[name]
             value, (mine, further) = float(each.value.value(self.setting)), np.split(further, [each.size])

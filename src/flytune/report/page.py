@@ -20,6 +20,7 @@ which says why there is nothing to draw. Captions live in the templates. Styles 
 import base64
 import functools
 import gzip
+import hashlib
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -29,6 +30,7 @@ from markupsafe import Markup
 from plotly.offline import get_plotlyjs
 
 from flytune.config import files
+from flytune.kernels import native
 
 
 def page_mark(template: str) -> bytes:
@@ -60,7 +62,7 @@ def _environment() -> jinja2.Environment:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.globals.update(asset=_asset, plotly=functools.cache(lambda: pack(get_plotlyjs())))
+    environment.globals.update(asset=_asset, plotly=_packed_plotly)
     environment.filters["packed"] = lambda plot: pack(plot.to_json(validate=False))
     environment.filters["base64"] = lambda text: base64.b64encode(text.encode()).decode()
     environment.tests["in_space"] = lambda plot: any(trace.type == "scatter3d" for trace in plot.data)
@@ -71,6 +73,21 @@ def _environment() -> jinja2.Environment:
 def _asset(name: str) -> Markup:
     """A file of `assets/`, which is ours and needs no escaping."""
     return Markup((resources.files("flytune.report") / "assets" / name).read_text(encoding="utf-8"))
+
+
+@functools.cache
+def _packed_plotly() -> str:
+    """The script of plotly, packed; kept beside the compiled programs, since to pack it takes a third of a second."""
+    script = get_plotlyjs()
+    folder = native.cache_folder()
+    if folder is None:
+        return pack(script)
+    place = folder / f"page-{hashlib.sha256(script.encode()).hexdigest()[:40]}"
+    if (known := native.kept(place)) is not None:
+        return known.decode()
+    packed = pack(script)
+    native.keep(place, packed.encode())
+    return packed
 
 
 def pack(text: str) -> str:

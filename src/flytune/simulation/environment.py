@@ -111,12 +111,14 @@ def assess(task: Task, episode: Episode, state: State, action: Float[Array, "4"]
 
 
 def with_slack(task: Task, moved: Episode, outcome: Outcome, slack: Any) -> Outcome:
-    """The outcome where an episode goes on until a margin is overdrawn by more than `slack`, a share of its bound.
+    """The outcome where an episode goes on until a margin is overdrawn by more than a share of its bound.
+
+    The share is `slack` times the `slack` of the termination.
 
     Where an episode ends at the bound itself, a gradient never sees what lies beyond: a barrier is then weakest just
     where it is needed.
     """
-    beyond = cause({name: margin + slack for name, margin in outcome.margins.items()})
+    beyond = cause({name: margin + slack * task.termination[name].slack for name, margin in outcome.margins.items()})
     terminated = beyond != SAFE
     truncated = (moved.steps >= task.horizon) & ~terminated
     return dataclasses.replace(outcome, cause=beyond, terminated=terminated, truncated=truncated)

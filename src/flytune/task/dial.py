@@ -31,6 +31,7 @@ class Dial:
     default: Annotated[Real, Unit("in its unit")]
     spacing: Literal["linear", "logarithmic"] = static(default="linear")  # drawn evenly in the value or its logarithm
     turned: Annotated[Real, Ge(0), Le(1), Unit("1")] = 0.0  # share of the episodes in which each update turns it
+    trained_beyond: Annotated[Real, Ge(0), Le(1), Unit("share of the range")] = 0.0  # training also draws past the ends
     sweep_time: Annotated[Real, Ge(0), Unit("s")] = 0.0  # in flight, a turn over the whole range takes this long
     unit: str = label(default="")
     meaning: str = label(default="")
@@ -60,13 +61,20 @@ class Dial:
         return xp.log(value / self.lowest) / xp.log(self.highest / self.lowest)
 
     def draw(self, key: jax.Array) -> jax.Array:
-        """A random value, even in the spacing."""
-        return self.at(jax.random.uniform(key, ()))
+        """A random value of a training episode, even in the spacing; up to `trained_beyond` past the ends."""
+        beyond = self.trained_beyond
+        return self.at((1 + 2 * beyond) * jax.random.uniform(key, ()) - beyond)
 
     def grid(self, number: int) -> list[float]:
         """Values from `lowest` to `highest`, both included, even in the spacing."""
         inner = [float(self.at(index / (number - 1))) for index in range(1, number - 1)]
         return [float(self.lowest), *inner, float(self.highest)]
+
+    def trained_grid(self, number: int) -> list[float]:
+        """The grid of so many values, and the ends of what training draws."""
+        if not self.trained_beyond:
+            return self.grid(number)
+        return [float(self.at(-self.trained_beyond)), *self.grid(number), float(self.at(1 + self.trained_beyond))]
 
 
 @pytree

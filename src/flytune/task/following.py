@@ -10,7 +10,8 @@ from flytune.config.formula import FUNCTIONS, Formula
 from flytune.errors import BadInput
 from flytune.task.dial import Dial, Input, Setting
 
-FOLLOWING = ("target", "noise", "reward", "termination", "vehicle", "duration")  # parts whose fields may follow a dial
+# parts whose fields may follow a dial
+FOLLOWING = ("target", "noise", "reward", "termination", "vehicle", "duration", "horizon")
 MOST_DIALS = 4  # all their settings together are checked
 CHECKED = {1: 9, 2: 5, 3: 4, 4: 3}  # number of dials -> settings of each at which a task is checked
 
@@ -68,7 +69,7 @@ def check_given(follow: Mapping[str, Formula], tables: Mapping[str, Any], given:
 
 def settings_to_check(dials: Mapping[str, Dial]) -> Iterator[dict[str, float]]:
     """Settings from end to end of all dials together, at which every value of a task has to be allowed."""
-    grids = [dial.grid(CHECKED[len(dials)]) for dial in dials.values()]
+    grids = [dial.trained_grid(CHECKED[len(dials)]) for dial in dials.values()]
     return (dict(zip(dials, values, strict=True)) for values in itertools.product(*grids))
 
 
@@ -87,7 +88,8 @@ def tables_at(tables: Mapping[str, Any], setting: Setting, prefix: str = "") -> 
     for path, formula in tables["follow"].items():
         if nested.look_up(fixed, path) is None or isinstance(nested.look_up(fixed, path), dict):
             raise BadInput(f"{prefix}follow.{path}: the task has no such number. Allowed: the path of a field.")
-        fixed = nested.edit(fixed, path, _value(formula, setting, f"{prefix}follow.{path}"))
+        value = _value(formula, setting, f"{prefix}follow.{path}")
+        fixed = nested.edit(fixed, path, math.ceil(value) if path == "horizon" else value)  # of whole steps
     for name, each in tables["input"].items():
         _value(each["value"], setting, f"{prefix}input.{name}.value")
     return fixed

@@ -34,6 +34,7 @@ class Bounded:
     quantity: ClassVar[str]
     key: ClassVar[str] = "bound"
     barrier: Annotated[Real, Ge(0), Unit("times apg.barrier_weight")] = 1.0  # of the analytic policy gradient
+    slack: Annotated[Real, Ge(0), Unit("times apg.termination_slack")] = 1.0  # of the analytic policy gradient
 
     @property
     def limit(self) -> Any:

@@ -139,6 +139,7 @@ class ApgSettings:
     max_grad_norm: Annotated[Real, Gt(0), Unit("1")] = 1.0
     barrier_weight: Annotated[Real, Ge(0), Unit("1")] = 45.0
     barrier_margin: Annotated[Real, Ge(0), Lt(1), Unit("1")] = 0.1  # the barrier begins below this margin
+    barrier_knee: Annotated[Real, Ge(0), Unit("1")] = 0.0  # deeper below it by more, the barrier is linear; 0: nowhere
     termination_slack: Annotated[Real, Ge(0), Unit("1")] = 0.0  # share of a bound; beyond it by more, an episode ends
     input_scale: tuple[Positive, Positive, Positive, Positive, Positive] = (2.0, 3.0, 2.0, 0.3, 1.0)  # per block of R7
     hidden: tuple[Layer, ...] = (64, 64)

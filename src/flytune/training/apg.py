@@ -96,8 +96,16 @@ def start(task: Task, settings: ApgSettings, key: Array) -> TrainState:
 
 
 def barrier(margin: Float[Array, ""], settings: ApgSettings) -> Float[Array, ""]:
-    """The cost of a margin: barrier_weight * max(0, barrier_margin - margin)^2."""
-    return settings.barrier_weight * jnp.maximum(settings.barrier_margin - margin, 0.0) ** 2
+    """The cost of a margin: barrier_weight * depth^2 with depth = max(0, barrier_margin - margin).
+
+    Beyond a depth of `barrier_knee` it goes on as a straight line, so that an episode far beyond its bound does not
+    outweigh all others.
+    """
+    depth, knee = jnp.maximum(settings.barrier_margin - margin, 0.0), settings.barrier_knee
+    if knee == 0:
+        return settings.barrier_weight * depth**2
+    near = jnp.minimum(depth, knee)
+    return settings.barrier_weight * (near**2 + 2 * knee * (depth - near))
 
 
 def warm_start(

@@ -154,7 +154,7 @@ class Trainer:
         """Refuse a warm start that is not possible, before anything is written.
 
         Raises:
-            BadInput: the trainer has no warm start, or its policies have other inputs, layers, bounds or another squash.
+            BadInput: the trainer has no warm start, or the policy has other inputs, layers, squash or bounds.
         """
         from flytune.config import document
 
