@@ -14,11 +14,10 @@ from flytune.runs.find import find_controller
 from flytune.runs.shipped import shipped_names
 from flytune.simulation.simulators import SIMULATORS
 from flytune.task.files import load_task, preset_names
-from flytune.training.trainer import trainer_names
 
 COMMANDS = (
     "train", "evaluate", "compare", "report", "map", "tune", "rules", "reproduce", "export", "list", "show", "bench",
-    "completion",
+    "judge", "completion",
 )  # fmt: skip
 
 
@@ -48,7 +47,7 @@ def test_the_list_names_everything_that_commands_take_with_a_line_each(capsys):
     names = {kind: list(entries) for kind, entries in known.items()}
     assert names == {
         "presets": preset_names(), "vehicles": vehicle_names(), "conditions": [], "policies": shipped_names(),
-        "controllers": list(CLASSICAL), "simulators": list(SIMULATORS), "trainers": list(trainer_names()),
+        "controllers": list(CLASSICAL), "simulators": list(SIMULATORS),
     }  # fmt: skip
     lines = [line for entries in known.values() for line in entries.values()]
     assert all(line.endswith(".") and "\n" not in line and " " in line for line in lines)

@@ -10,10 +10,9 @@ import pytest
 
 from flytune.cli.main import main, make_app
 from flytune.cli.options import assignments
-from flytune.errors import BadInput
 
 OPTIONS = {
-    "train": "TASK --trainer --seed --steps --out --set --from --resume --tensorboard",
+    "train": "TASK --trainer --seed --steps --out --set --from --resume --tensorboard --json",
     "evaluate": "CONTROLLER --task --world --world-set --trials --seed --duration --starts --dial --json --out "
     "--flights",
     "compare": "CONTROLLER --task --world --world-set --trials --seed --duration --starts --dial --json --out "
@@ -23,12 +22,14 @@ OPTIONS = {
     "map": "CONTROLLER --dial --measure --json",
     "tune": "TASK --settling-time --at-most --tolerance --overshoot --error --axis --percentile --set --rules "
     "--trainer "
-    "--iterations --seed --out --resume",
+    "--iterations --seed --out --resume --json",
     "rules": "--rules --json",
     "reproduce": "--trainer --seeds --steps --refined --out --json",
     "export": "CONTROLLER --format --out",
+    "list": "--json",
     "show": "TASK",
     "bench": "WHAT --json",
+    "completion": "SHELL",
 }
 
 
@@ -77,7 +78,7 @@ def test_a_command_explains_every_option_it_has(command, capsys):
     listed = [
         line.split()[0]
         for line in words
-        if line.split() and line.split()[0].startswith(("--", "TASK", "CONT", "WHAT", "FILE"))
+        if line.split() and line.split()[0].startswith(("--", "TASK", "CONT", "WHAT", "FILE", "SHELL"))
     ]
     assert [name for name in OPTIONS[command].split() if name not in listed] == []
 
@@ -101,11 +102,8 @@ def test_assignments_may_follow_one_option_or_repeat_it():
     assert options.seed == 4
 
 
-def test_two_values_of_one_path_are_refused():
-    with pytest.raises(BadInput, match=r"^a\.b: has two values, 1 and 2\. Give one of them\.$"):
-        assignments(("a.b=1", "c=3", "a.b=2"))
-    assert assignments(("a.b=1", "a.b=1")) == {"a.b": 1}
-    assert list(assignments(("a.b=nan",))) == ["a.b"]
+def test_of_two_values_of_one_path_the_last_one_counts():
+    assert assignments(("a.b=1", "c=3", "a.b=2")) == {"a.b": 2, "c": 3}
 
 
 def test_an_option_that_is_given_twice_counts_as_given_last():
@@ -126,10 +124,9 @@ def test_every_option_arrives_with_its_type():
 
 def test_a_bare_tuning_asks_for_what_the_help_says():
     *_, options = parsed("tune", "--settling-time", "2.5")
-    assert (options.settling_time, options.tolerance, options.overshoot, options.error) == (2.5, 10.0, 5.0, None)
-    assert (options.axis, options.percentile, options.trainer, options.most_iterations, options.seed) == (
-        "position", 50.0, "apg", 12, 0,
-    )  # fmt: skip
+    assert (options.settling_time, options.tolerance, options.axis) == (2.5, 10.0, ("position",))
+    assert (options.overshoot, options.error, options.percentile) == ((), (), ())  # the defaults of flytune.tune
+    assert (options.trainer, options.most_iterations, options.seed) == ("apg", 12, 0)
 
 
 def test_the_iterations_of_a_tuning_may_be_called_steps():

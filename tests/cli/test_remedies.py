@@ -21,7 +21,7 @@ from flytune.control.policy import load_policy, save_policy
 from flytune.runs.directory import CHECKPOINT, RunDirectory
 from flytune.task.files import load_task
 from flytune.training.trainer import find_trainer
-from flytune.tuning.requirement import make_requirement
+from flytune.tuning.asked import make_requirement
 
 ROOT = Path(__file__).parents[2]
 FLY = ["--trials", "1", "--duration", "1"]

@@ -61,7 +61,7 @@ def test_a_tuning_is_resumed_only_with_the_same_arguments(tmp_path):
     with pytest.raises(BadInput, match=r"tune\.json is damaged"):
         tune(3.4, out=tmp_path / "t", edits=fixed, resume=True)
     (tmp_path / "t" / "tune.json").write_text('{"schema": 1}')
-    with pytest.raises(BadInput, match=r"tune\.json has schema 1\. Allowed: schema 2"):
+    with pytest.raises(BadInput, match=r"tune\.json has schema 1\. Allowed: schema 3"):
         tune(3.4, out=tmp_path / "t", edits=fixed, resume=True)
 
 

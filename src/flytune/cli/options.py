@@ -111,18 +111,14 @@ FLIGHT_DEFAULTS = FlightOptions()
 
 
 def assignments(texts: Sequence[str]) -> dict[str, Any]:
-    """Path and value of each PATH=VALUE.
+    """Path and value of each PATH=VALUE; the last one of a path counts, as with every option.
 
     Raises:
-        BadInput: a text that is no assignment, or two values of one path.
+        BadInput: a text that is no assignment.
     """
     from flytune.config.document import parse_assignment
 
-    values: dict[str, Any] = {}
-    for path, value in map(parse_assignment, texts):
-        if repr(values.setdefault(path, value)) != repr(value):  # nan is not equal to itself
-            raise BadInput(f"{path}: has two values, {values[path]} and {value}. Give one of them.")
-    return values
+    return dict(map(parse_assignment, texts))
 
 
 def check_folder(folder: Path | None, controller: str = "") -> None:

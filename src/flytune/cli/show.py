@@ -13,7 +13,7 @@ def show(task: Task, /) -> None:
 
 
 def list(*, as_json: AsJson = False) -> None:
-    """Print the names that commands take: presets, vehicles, policies, controllers, simulators and trainers."""
+    """Print the names that commands take: presets, vehicles, policies, controllers and simulators."""
     from flytune.runs.catalogue import catalogue
 
     known = catalogue()

@@ -1,4 +1,4 @@
-"""What can be named: presets, vehicles, policies that ship, controllers, simulators and trainers, with a line each."""
+"""What can be named: presets, vehicles, policies that ship, controllers and simulators, with a line each."""
 
 import json
 from importlib import resources
@@ -8,7 +8,6 @@ from flytune.physics.vehicle import vehicle_names
 from flytune.runs.shipped import shipped_files, shipped_names
 from flytune.simulation.simulators import SIMULATORS
 from flytune.task.files import preset_names
-from flytune.training.trainer import TRAINERS
 
 
 def catalogue() -> dict[str, dict[str, str]]:
@@ -22,7 +21,6 @@ def catalogue() -> dict[str, dict[str, str]]:
         "policies": {name: _training(name) for name in shipped_names()},
         "controllers": {name: _first_sentence("flytune.control", "gains", name) for name in classical},
         "simulators": SIMULATORS,
-        "trainers": {name: f"{trainer.summary[0].upper()}{trainer.summary[1:]}." for name, trainer in TRAINERS.items()},
     }
 
 

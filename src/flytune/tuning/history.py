@@ -97,6 +97,8 @@ class History:
             self.iterations = [Iteration.from_dict(each) for each in journal["iterations"]]
             self.validations = [Validation(**each) for each in journal["validations"]]
             before = {name: journal[name] for name in self.asked}
+        except BadInput:
+            raise
         except OSError:
             raise BadInput(f"resume: {self.directory} holds no tuning. Leave out --resume to start one.") from None
         except (ValueError, KeyError, TypeError, AttributeError) as error:
