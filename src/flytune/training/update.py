@@ -19,6 +19,10 @@ from flytune.task.task import Task
 from flytune.task.termination import causes
 
 T = TypeVar("T")
+SMALLER_STEPS = (
+    "A smaller learning rate (--set apg.learning_rate=VALUE or ppo.learning_rate=VALUE) helps; that of the presets is a "
+    "start."
+)
 LARGE = 1e4  # per step; rewards and costs of the presets are near 1
 
 
@@ -135,10 +139,13 @@ def _remedy(row: dict[str, Any]) -> str:
     """What helps where numbers stopped being finite: the cause, as far as the metrics of the update show it."""
     rewards = row["terms"] | {"": row["reward"]}
     if not all(math.isfinite(each) for each in rewards.values()):
-        return (
-            "The flight of a vehicle is no longer finite. Tighter bounds in [termination], which end an episode "
-            "before that, help; or a vehicle that turns less within a control step of 0.01 s."
+        flight = (
+            "Tighter bounds in [termination], which end an episode before that, help; or a vehicle that turns less "
+            "within a control step of 0.01 s."
         )
+        if row["update"] == 1:
+            return f"The flight of a vehicle is no longer finite. {flight}"
+        return f"The weights of the policy or the flight of a vehicle are no longer finite. {SMALLER_STEPS} {flight}"
     largest = max(row["terms"], key=lambda name: abs(row["terms"][name]))
     if abs(row["terms"][largest]) > LARGE:
         return (
@@ -155,7 +162,4 @@ def _remedy(row: dict[str, Any]) -> str:
             "Nothing has been learned yet, so that it comes from the task. A smaller apg.window helps, since gradients "
             "grow with the number of steps; or smaller values of sharpness, wide and narrow in the reward."
         )
-    return (
-        "A smaller learning rate (--set apg.learning_rate=VALUE or ppo.learning_rate=VALUE) helps; that of the presets "
-        "is a start."
-    )
+    return SMALLER_STEPS
