@@ -61,8 +61,8 @@ def test_the_smallest_settings_of_a_trainer_train(trainer, edits):
 @pytest.mark.parametrize(
     ("trainer", "edits", "remedy", "cure"),
     [
-        ("ppo", {"ppo.learning_rate": 1e6}, "A smaller learning_rate helps", {"ppo.learning_rate": 2e-4}),
-        ("apg", {"apg.learning_rate": 1e10}, "A smaller learning_rate helps", {"apg.learning_rate": 5e-3}),
+        ("ppo", {"ppo.learning_rate": 1e6}, "A smaller learning rate", {"ppo.learning_rate": 2e-4}),
+        ("apg", {"apg.learning_rate": 1e10}, "A smaller learning rate", {"apg.learning_rate": 5e-3}),
         ("apg", {"reward.velocity.weight": 1e25}, "The term reward.velocity is ", {"reward.velocity.weight": 1.0}),
         ("ppo", {"reward.velocity.weight": 1e25}, "The term reward.velocity is ", {"reward.velocity.weight": 1.0}),
     ],

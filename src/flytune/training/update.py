@@ -20,8 +20,8 @@ from flytune.task.termination import causes
 
 T = TypeVar("T")
 SMALLER_STEPS = (
-    "A smaller learning rate (--set apg.learning_rate=VALUE or ppo.learning_rate=VALUE) helps; that of the presets is a "
-    "start."
+    "A smaller learning rate (--set apg.learning_rate=VALUE or ppo.learning_rate=VALUE) helps; that of the presets is "
+    "a start."
 )
 LARGE = 1e4  # per step; rewards and costs of the presets are near 1
 
