@@ -128,6 +128,13 @@ def test_a_setting_in_a_name_that_is_none_is_refused(name, message):
         find_controller(name)
 
 
+def test_a_settling_time_is_not_promised_for_another_vehicle():
+    with pytest.raises(BadInput, match=r"measured with the vehicle crazyflie, and this task flies crazyflie-measured"):
+        find_controller("dial@settling_time=4", load_task("baseline", {"vehicle": "crazyflie-measured"}))
+    assert find_controller("dial@settling_time=4", load_task("baseline", {"target.yaw": 1.0}))
+    assert find_controller("dial@speed=0.5", load_task("baseline", {"vehicle": "crazyflie-measured"}))
+
+
 def test_a_settling_time_in_a_name_is_flown_within_a_tenth():
     for wish in (2.5, 5.0):
         judged = evaluate(f"dial@settling_time={wish}", trials=200, seed=11).judgement

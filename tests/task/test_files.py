@@ -61,6 +61,21 @@ def test_a_written_task_needs_no_other_file(folder):
     assert read_task_text(text, "task.toml").vehicle.mass == 2.064308
 
 
+@pytest.mark.parametrize(
+    "missing", ["mass", "inertia", "propeller_radius", "drag", "gravity", "motor_rise_time_constant", "action_scale"]
+)
+def test_what_a_vehicles_file_lacks_is_missing_and_not_taken_from_the_vehicle_of_the_base(folder, missing):
+    path = folder / "mine.toml"
+    lines = path.read_text().splitlines()
+    write(path, "\n".join(line for line in lines if not line.startswith(missing)))
+    assert f"vehicle.{missing}: missing" in refusal(folder / "task.toml")
+
+
+def test_what_a_vehicles_file_may_leave_out_is_not_taken_from_the_vehicle_of_the_base(folder):
+    assert load_task("baseline").vehicle.ground_effect is not None
+    assert load_task(folder / "task.toml").vehicle.ground_effect is None
+
+
 def test_a_vehicle_on_the_command_line_is_relative_to_the_current_folder(folder, monkeypatch):
     monkeypatch.chdir(folder)
     assert load_task("baseline", {"vehicle": "mine.toml"}).vehicle.mass == 2.064308

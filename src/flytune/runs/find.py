@@ -74,8 +74,26 @@ class FoundController:
             )
         schedule = dict(schedule)
         if SETTLING_TIME in schedule and SETTLING_TIME not in controller.dials:
+            self._check_measured_on_this_vehicle()
             schedule |= _by_settling_time(self.name, controller, schedule.pop(SETTLING_TIME), schedule)
         return dataclasses.replace(self, controller=with_schedule(controller, schedule), name=name or self.name)
+
+    def _check_measured_on_this_vehicle(self) -> None:
+        """Refuse a settling time where the task has another vehicle than that of the response map.
+
+        Raises:
+            BadInput: the vehicles differ.
+        """
+        controller: Any = self.controller
+        text = controller.about.get("task_toml")
+        measured = read_task_text(text, self.name).vehicle if text else self.task.vehicle
+        if nested.first_difference(document.plain(measured), document.plain(self.task.vehicle)) is not None:
+            dial = next(iter(controller.dials))
+            raise BadInput(
+                f"settling_time: the response map of {self.name} was measured with the vehicle {measured.name}, and "
+                f"this task flies {self.task.vehicle.name}. Set the dial itself, {self.name}@{dial}=VALUE, or let "
+                "flytune find it: flytune tune TASK --settling-time S."
+            )
 
     def fixed(self) -> Policy:
         """The policy at its setting without its dials, with the task at this setting in its header.

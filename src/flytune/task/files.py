@@ -99,7 +99,8 @@ def _from_file(path: Path, above: tuple[Path, ...] = ()) -> tuple[dict[str, Any]
         raise BadInput(f"{above[0]}: based_on: leads back to {path}. Base one of these files on a preset.")
     given = document.load(path)
     data = _with_sources({"name": path.stem, **given}, str(path))
-    if isinstance(vehicle := data.get("vehicle"), str):
+    named = isinstance(vehicle := data.get("vehicle"), str)
+    if isinstance(vehicle, str):
         data["vehicle"] = vehicle_table(vehicle, path.parent, f"{path}: ")
     if "based_on" not in data:
         return data, given
@@ -114,13 +115,21 @@ def _from_file(path: Path, above: tuple[Path, ...] = ()) -> tuple[dict[str, Any]
             f"{path}: based_on: {base!r} is no preset. Allowed: {', '.join(preset_names())}, or a .toml file."
             + (f" Did you mean {hint}?" if hint else "")
         )
-    return _laid_over(below, data, str(path)), nested.overlay(said, given)
+    return _laid_over(below, data, str(path), whole_vehicle=named), nested.overlay(said, given)
 
 
-def _laid_over(below: dict[str, Any], data: dict[str, Any], where: str) -> dict[str, Any]:
+def _laid_over(
+    below: dict[str, Any], data: dict[str, Any], where: str, *, whole_vehicle: bool = False
+) -> dict[str, Any]:
     """The tables of a file laid over those of its base, so that it need only say what it changes.
 
     An empty table of named entries, for instance `termination = {}`, removes all of them.
+
+    Args:
+        below: the tables of the base.
+        data: those of the file.
+        where: the name of the file.
+        whole_vehicle: whether its vehicle has a file of its own, and so takes nothing from the base.
 
     Raises:
         BadInput: the file removes what its base does not have.
@@ -132,7 +141,7 @@ def _laid_over(below: dict[str, Any], data: dict[str, Any], where: str) -> dict[
                 _check_there(below, (name, key), f"{where}: ")
         if changes.get(name) == {}:
             below = {**below, name: {}}
-    if isinstance(vehicle := changes.get("vehicle"), dict) and "vehicle" in below:
+    if isinstance(vehicle := changes.get("vehicle"), dict) and "vehicle" in below and not whole_vehicle:
         changes["vehicle"] = _vehicle_over(below["vehicle"], vehicle)
     if "vehicle" in changes:  # which is laid over already
         below = {key: value for key, value in below.items() if key != "vehicle"}
