@@ -170,3 +170,14 @@ def test_flights_that_hold_their_target_take_no_other_and_no_columns(tmp_path, m
         said = refused("judge", "f.npz", f"--{option}", value, capsys=capsys)
         assert f"{option}: " in said and f"Leave out --{option}" in said
     assert main(["judge", "f.npz"]) == 0
+
+
+@pytest.mark.parametrize(
+    ("name", "guessed"), [("yaw", True), ("yaw[rad]", False), ("yaw_rad", False), ("yaw [deg]", False)]
+)
+def test_an_angle_whose_unit_nothing_says_is_named_with_the_way_to_say_it(tmp_path, monkeypatch, capsys, name, guessed):
+    monkeypatch.chdir(tmp_path)
+    written(tmp_path / "log.csv", f"t,x,y,z,{name}", TIME, X, Y, Z, YAW)
+    assert main(["judge", "log.csv", "--target", "0,0,1,0"]) == 0
+    said = capsys.readouterr().err
+    assert ("taken as rad. For degrees, give --columns 'yaw=yaw[deg]'" in said) == guessed

@@ -172,17 +172,23 @@ def _read(table: LogTable, chosen: dict[str, Column], say: Say) -> dict[str, np.
     indices = sorted({column.index for column in chosen.values() if column.index is not None})
     numbers = table.read(indices)
     values: dict[str, np.ndarray] = {}
+    guessed: list[str] = []
     for quantity, column in chosen.items():
         if column.index is None:
             values[quantity] = np.full(len(numbers), column.constant)
             continue
         raw = numbers[:, indices.index(column.index)]
         known = units_of(quantity)
+        if quantity.endswith("yaw") and not column.unit:  # small angles could be degrees as well
+            guessed.append(f"{quantity}: nothing says its unit, so it is taken as rad. For degrees, give --columns "
+                           f"'{quantity}={column.name}[deg]'")  # fmt: skip
         unit = column.unit or _unit(table, quantity, column, raw) if known else ""
         chosen[quantity] = Column(column.name, column.index, unit, column.sign)
         values[quantity] = raw * column.sign * known.get(unit, 1.0)
     taken = ", ".join(f"{quantity} = {column}" for quantity, column in chosen.items())
     say(f"{table.path}: {len(numbers)} rows, {DELIMITERS.get(table.delimiter, table.delimiter)} between cells; {taken}")
+    for line in guessed:
+        say(f"{table.path}: {line}")
     return values
 
 
