@@ -15,7 +15,7 @@ from flytune.physics.dynamics import hovering
 from flytune.simulation.jax_simulator import JaxSimulator
 from flytune.simulation.simulators import make_simulator
 from flytune.task.files import load_task
-from flytune.task.initial_state import EVALUATION_INITIAL_STATES
+from flytune.task.initial_state import InitialState
 from flytune.task.situation import situation
 from flytune.task.termination import margins
 
@@ -146,25 +146,27 @@ def test_a_crash_is_counted_and_held_and_the_others_fly_on(task, own, simulator)
     np.testing.assert_allclose(flights.position[~flights.crashed], diver.position[~diver.crashed], atol=0.018)
 
 
-@pytest.mark.parametrize("target", [0.0, 9.5])  # some crash on the way; some begin lost
-def test_a_crashed_vehicle_waits_at_the_target(task, simulator, target):
-    there = dataclasses.replace(task, target=dataclasses.replace(task.target, position=(target, 0.0, 1.0)))
-    made = make_simulator(simulator, there.vehicle, 8) if isinstance(simulator, str) else simulator(there.vehicle, 8)
-    starts, noise_keys = _begin(there, EVALUATION_INITIAL_STATES["clear"], trial_keys(1, 8))
-    crashed = rollout_trials(made, Diver(), there, starts, noise_keys, 200, "diver").crashed
-    away = np.linalg.norm(made.states().position - there.target.position, axis=-1)
+@pytest.mark.parametrize("lost", [0, 3])  # some crash on the way; some begin lost
+def test_a_crashed_vehicle_waits_at_the_target(task, simulator, lost):
+    made = make_simulator(simulator, task.vehicle, 8) if isinstance(simulator, str) else simulator(task.vehicle, 8)
+    starts, noise_keys = _begin(task, trial_keys(1, 8))
+    starts = starts.at[0, :lost].add(15.0)
+    crashed = rollout_trials(made, Diver(), task, starts, noise_keys, 200, "diver").crashed
+    assert crashed[:lost].all()
+    away = np.linalg.norm(made.states().position - task.target.position, axis=-1)
     made.close()
     assert 0 < crashed.sum() < 8
     assert away[crashed].max() < 1e-3 and away[~crashed].min() > 0.1
 
 
-def test_a_trial_that_begins_lost_is_crashed_from_the_start(task, simulator):
-    far = dataclasses.replace(task, target=dataclasses.replace(task.target, position=(9.5, 0.0, 1.0)))
-    flights = fly(Echo(gain=jnp.float32(0.0)), far, trials=8, duration=0.6, simulator=simulator)
-    lost = np.linalg.norm(flights.position[:, 0] - [9.5, 0, 1], axis=-1) > 10
-    assert 0 < lost.sum() < 8
-    np.testing.assert_array_equal(flights.crashed, lost)
-    assert not np.diff(flights.position[lost], axis=1).any()
+def test_a_trial_that_begins_far_away_is_not_lost(task, simulator):
+    starts = InitialState(
+        lowest_position=(-20.0, 0.0, 1.0), highest_position=(-9.0, 0.0, 1.0), largest_tilt=0.1, largest_yaw=1.0
+    )
+    hover = Echo(gain=jnp.float32(0.0))
+    flights = fly(hover, task, trials=8, duration=0.6, simulator=simulator, initial_conditions=starts)
+    assert np.linalg.norm(flights.position[:, 0] - task.target.position, axis=-1).max() > 10
+    assert not flights.crashed.any() and not judge(flights).crashed.any()
 
 
 def test_margins_are_those_of_the_recorded_state(task, simulator):

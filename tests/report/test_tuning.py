@@ -39,6 +39,7 @@ TUNING = {
         "axis": "position",
         "percentile": 50.0,
         "settled": 0.95,
+        "others": [],
     },
     "directory": "runs/tune-6s",
     "start": "baseline-refined",
@@ -60,6 +61,7 @@ TUNING = {
                 },
             },
             "misses": {},
+            "axes": {},
         }
     ],
 }

@@ -198,8 +198,8 @@ def test_a_term_may_be_added_and_needs_to_be_complete():
 def test_an_unknown_preset_is_refused_with_the_nearest_name():
     text = refusal("baselin")
     allowed = (
-        "acrobatic, acrobatic-refined, baseline, baseline-refined, dial, inspection, inspection-refined, or a .toml "
-        "file."
+        "acrobatic, acrobatic-refined, baseline, baseline-refined, dial, inspection, inspection-refined, a .toml file, "
+        "or a run directory."
     )
     assert text.startswith(f"task: 'baselin' is no preset. Allowed: {allowed}")
     assert text.endswith("Did you mean baseline?")

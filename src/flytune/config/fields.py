@@ -73,6 +73,8 @@ def nearest(name: str, options: Iterable[str]) -> str | None:
     options = list(options)
     if found := difflib.get_close_matches(name, options, n=1, cutoff=0.75):
         return found[0]
+    if same := [each for each in options if sorted(each) == sorted(name)]:  # two letters have changed places
+        return same[0]
     words = set(name.split("_"))
     shared = [each for each in options if words <= set(each.split("_")) or set(each.split("_")) <= words]
     return min(shared, key=len, default=None)

@@ -41,7 +41,8 @@ def check_starts(
         BadInput: the bound, its value, what starts are like, and the remedy.
     """
     for setting in settings_to_check(task.dial) if task.dial else [{}]:
-        if problem := disagreement(task.at(setting), initial_state or task.initial_state, where, slack):
+        fixed = task.fixed_at(setting) if setting else task
+        if problem := disagreement(fixed, initial_state or task.initial_state, where, slack):
             raise BadInput(f"at {words(setting)}: {problem}" if setting else problem)
 
 

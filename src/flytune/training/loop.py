@@ -82,10 +82,10 @@ def train(
     method = find_trainer(trainer)
     if not 0 <= seed < 2**32:
         raise BadInput(f"seed: {seed} is not allowed. Allowed: a whole number, 0 to {2**32 - 1}.")
-    method.check(task)
     start = None if warm_start is None else as_warm_start(warm_start)
     if start is not None:
         method.check_warm_start(task, start.policy, start.field)
+    method.check(task)
     if resume and out is not None:
         check_ended(out, task, trainer, seed)
     if tensorboard:
