@@ -1,0 +1,193 @@
+"""URDF: as gym-pybullet-drones writes it, with a tag `properties`, or with the motor models of Gazebo."""
+
+import math
+import re
+
+from flytune.errors import BadInput
+from flytune.physics.found_vehicle import FoundVehicle
+from flytune.physics.rotors import X_SIDES
+from flytune.simulation.reading import gazebo_motors
+from flytune.simulation.reading.bodies import INERTIA, Body, Pose, inertia_matrix
+from flytune.simulation.reading.markup import Element, number, numbers
+from flytune.simulation.reading.rotors import Rotor, check_four, frame_tables, rotor_frame
+
+PROPERTIES = {  # attribute -> field of a vehicle
+    "kf": "thrust_coefficient",
+    "km": "torque_coefficient",
+    "thrust2weight": "thrust_to_weight",
+    "prop_radius": "propeller_radius",
+    "gnd_eff_coeff": "ground_effect",
+}
+DRAG = ("drag_coeff_xy", "drag_coeff_z")
+SPINS = (-1, 1, -1, 1)  # gym-pybullet-drones, BaseAviary: torque about z of motors 0 to 3
+MOTORS = "a tag <properties kf= km= ...> as in gym-pybullet-drones, or the motor models of Gazebo"
+
+
+def read_urdf(root: Element, file: str) -> FoundVehicle:
+    """The vehicle of a URDF file.
+
+    Args:
+        root: the element `robot`.
+        file: the file's name, for messages and sources.
+
+    Raises:
+        BadInput: no motors, other than four rotors, or what no vehicle has.
+    """
+    frames = link_frames(root, file)
+    bodies = [
+        body for link in root.iter("link") if (body := _body(link, frames[link.get("name", "")], file)) is not None
+    ]
+    plugins = [plugin for plugin in root.iter("plugin") if gazebo_motors.is_motor(plugin)]
+    properties = root.find("properties")
+    if plugins:
+        return _with_motor_models(root, file, frames, bodies, plugins)
+    if properties is None or properties.get("kf") is None:
+        raise BadInput(f"{file}: has no motors. Missing: {MOTORS}.")
+    return _with_properties(root, properties, file, frames, bodies)
+
+
+def link_frames(root: Element, file: str) -> dict[str, Pose]:
+    """The frame of each link, from that of the link at the root.
+
+    Raises:
+        BadInput: the joints do not make one tree of the links.
+    """
+    names = [link.get("name", "") for link in root.iter("link")]
+    above: dict[str, tuple[str, Pose]] = {}
+    for joint in root.iter("joint"):
+        parent, child = joint.find("parent"), joint.find("child")
+        if parent is None or child is None:
+            continue  # of a transmission, which names a joint
+        ends = parent.get("link", ""), child.get("link", "")
+        if not set(ends) <= set(names) or ends[1] in above:
+            raise BadInput(f"{file}: joint {joint.get('name')!r}: does not join two links of the file as a tree.")
+        above[ends[1]] = (ends[0], _origin(joint, f"{file}: joint {joint.get('name')!r}"))
+    roots = [name for name in names if name not in above]
+    if len(roots) != 1 or len(set(names)) != len(names):
+        raise BadInput(f"{file}: its {len(names)} links are no tree. Allowed: links with joints, and one at the root.")
+    frames = {roots[0]: Pose()}
+    waiting = dict(above)
+    while ready := [name for name, (parent, _) in waiting.items() if parent in frames]:
+        for name in ready:
+            parent, origin = waiting.pop(name)
+            frames[name] = frames[parent] @ origin
+    if waiting:
+        raise BadInput(f"{file}: links {sorted(waiting)} hang on each other. Allowed: links with joints as a tree.")
+    return frames
+
+
+def _origin(element: Element, where: str) -> Pose:
+    origin = element.find("origin")
+    if origin is None:
+        return Pose()
+    return Pose.of(
+        numbers(origin.get("xyz", "0 0 0"), 3, f"{where}: origin xyz"),
+        numbers(origin.get("rpy", "0 0 0"), 3, f"{where}: origin rpy"),
+    )
+
+
+def _body(link: Element, frame: Pose, file: str) -> Body | None:
+    inertial = link.find("inertial")
+    if inertial is None:
+        return None
+    where = f"{file}: link {link.get('name')!r}"
+    mass, inertia = inertial.find("mass"), inertial.find("inertia")
+    value = number(None if mass is None else mass.get("value"), f"{where}: mass")
+    if value < 0:
+        raise BadInput(f"{where}: mass: {value:g} is not allowed. Allowed: 0 or more kg.")
+    parts = {
+        name: number(inertia.get(name, "0"), f"{where}: inertia {name}") if inertia is not None else 0.0
+        for name in INERTIA
+    }
+    return Body(value, frame @ _origin(inertial, where), inertia_matrix(parts))
+
+
+def _with_properties(
+    root: Element, properties: Element, file: str, frames: dict[str, Pose], bodies: list[Body]
+) -> FoundVehicle:
+    """The vehicle of gym-pybullet-drones."""
+    given = {name: number(text, f"{file}: properties {name}") for name, text in properties.items() if _is_used(name)}
+    spins = tuple(-spin for spin in SPINS) if root.get("name") == "racer" else SPINS
+    rotors, source, notes = _propellers(root, given, file, frames, spins)
+    table, more = frame_tables(file, bodies, rotors)
+    sources = {
+        **dict.fromkeys(("mass", "inertia", "products_of_inertia"), f"{file}, inertial of all links"),
+        **dict.fromkeys(("arm", "rotors"), source),
+    }
+    for name, field in PROPERTIES.items():
+        if name in given:
+            table[field], sources[field] = given[name], f"{file}, properties {name}"
+    if any(name in given for name in DRAG):
+        across, along = (given.get(name, 0.0) for name in DRAG)
+        table["rotor_drag"] = [across, across, along]
+        sources["rotor_drag"] = f"{file}, properties drag_coeff_xy and drag_coeff_z"
+    unused = [name for name in properties.keys() if not _is_used(name)]  # noqa: SIM118
+    if unused:
+        notes.append(f"properties {', '.join(unused)}: flytune has no such number")
+    return FoundVehicle(file, table, sources, (*notes, *more))
+
+
+def _is_used(name: str) -> bool:
+    return name in PROPERTIES or name in DRAG or name == "arm"
+
+
+def _propellers(
+    root: Element, given: dict[str, float], file: str, frames: dict[str, Pose], spins: tuple[int, ...]
+) -> tuple[list[Rotor], str, list[str]]:
+    """The rotors, where they come from, and notes: from the links prop0 to prop3, or else from the arm."""
+    links = {
+        int(match[1]): link
+        for link in root.iter("link")
+        if (match := re.fullmatch(r"(?:prop(?:eller)?|rotor|motor)_?(\d+)(?:_link)?", link.get("name", "")))
+    }
+    note = (
+        "the spins are not in the file; they are those with which gym-pybullet-drones flies "
+        f"{'its racer' if spins != SPINS else 'it'}: {list(spins)}; look at the propellers"
+    )
+    if not links and given.get("arm", 0) > 0:
+        side = given["arm"] / math.sqrt(2)
+        places = [rotor_frame([side * x, side * y, 0]) for x, y in X_SIDES]
+        where = [Rotor(f"motor {index}", place, spins[index]) for index, place in enumerate(places)]
+        return where, f"{file}, properties arm, in x configuration", [note]
+    check_four(list(links), file, "links named prop0, prop1, ...")
+    rotors = []
+    for spin, index in zip(spins, sorted(links), strict=True):
+        link = links[index]
+        inertial = link.find("inertial")
+        name = link.get("name", "")
+        inner = Pose() if inertial is None else _origin(inertial, f"{file}: link {name!r}")
+        rotors.append(Rotor(f"link {name!r}", frames[name] @ inner, spin))
+    notes = [note]
+    reach = max(math.hypot(*rotor.frame.position[:2]) for rotor in rotors)
+    if "arm" in given and abs(given["arm"] - reach) > 1e-6 * reach:
+        notes.append(f"properties arm {given['arm']:g} m is not used; the links place the rotors {reach:.6g} m out")
+    return rotors, f"{file}, links prop0 to prop3; spins as in gym-pybullet-drones", notes
+
+
+def _with_motor_models(
+    root: Element, file: str, frames: dict[str, Pose], bodies: list[Body], plugins: list[Element]
+) -> FoundVehicle:
+    """The vehicle of RotorS and PX4."""
+    motors = gazebo_motors.motors(plugins, file)
+    check_four(motors, file, "motor models")
+    for motor in motors:
+        if motor.link not in frames:
+            raise BadInput(f"{file}: motor {motor.number}: linkName: there is no link {motor.link!r}.")
+    rotors = [Rotor(f"link {motor.link!r}", frames[motor.link], motor.spin) for motor in motors]
+    table, notes = frame_tables(file, bodies, rotors)
+    values, sources, more = gazebo_motors.motor_tables(motors, file)
+    radius = _radius([link for link in root.iter("link") if link.get("name") in {motor.link for motor in motors}], file)
+    if radius:
+        values["propeller_radius"] = radius
+    sources |= {
+        **dict.fromkeys(("mass", "inertia", "products_of_inertia"), f"{file}, inertial of all links"),
+        **dict.fromkeys(("arm", "rotors"), f"{file}, joints of the rotors; turningDirection"),
+        "propeller_radius": f"{file}, shape of the rotors",
+    }
+    return FoundVehicle(file, table | values, sources, (*notes, *more))
+
+
+def _radius(links: list[Element], file: str) -> float:
+    """The radius of the cylinders that the rotors are, or 0."""
+    cylinders = [cylinder for link in links for cylinder in link.iter("cylinder")]
+    return max((number(each.get("radius"), f"{file}: cylinder radius") for each in cylinders), default=0.0)
