@@ -12,8 +12,8 @@ from scipy.optimize import linprog
 from tests.layouts import LAYOUTS, with_layout
 
 from flytune.control.actuation import action_for, allocate, estimated_rotor_speed, hovering_rotors
-from flytune.physics.dynamics import CONTROL_PERIOD, commanded_rotor_speed, rotor_speed_after
-from flytune.physics.rotors import mixed, places, spins, thrust_and_torque
+from flytune.physics.dynamics import CONTROL_PERIOD, rotor_speed_after
+from flytune.physics.rotors import commanded_rotor_speed, mixed, places, spins, thrust_and_torque
 from flytune.physics.vehicle import Rotors, load_vehicle, vehicle_names
 
 VEHICLES = {name: load_vehicle(name) for name in vehicle_names()}
@@ -71,7 +71,7 @@ def test_a_saturated_yaw_torque_gives_way_and_leaves_thrust_roll_and_pitch_alone
 def test_thrust_gives_way_to_roll_and_pitch(name):
     vehicle = VEHICLES[name]
     weight = vehicle.mass * vehicle.gravity
-    largest = weight * vehicle.thrust_to_weight
+    largest = weight * vehicle.full_thrust_to_weight
     torque = (0.1 * weight * vehicle.lever, 0.1 * weight * vehicle.lever, 0.0)
     _, thrust, given_torque = delivered(vehicle, 10 * weight, torque)
     np.testing.assert_allclose(given_torque[:2], torque[:2], rtol=1e-4)

@@ -122,10 +122,10 @@ def test_the_figures_of_the_papers_vehicle_are_those_worked_out_by_hand():
 
 
 def test_a_thrust_to_weight_of_12_is_allowed():
-    assert airframe("five inches").thrust_to_weight == pytest.approx(3.46**2)
+    assert airframe("five inches").full_thrust_to_weight == pytest.approx(3.46**2)
 
 
 def test_rotor_drag_in_another_unit_is_refused():
     vehicle = load_vehicle("crazyflie")
-    wrong = dataclasses.replace(vehicle, rotor_drag=tuple(1e3 * each for each in vehicle.rotor_drag))
+    wrong = dataclasses.replace(vehicle, rotor_drag=tuple(1e3 * each for each in vehicle.optional_rotor_drag))
     assert "rotor drag at hover over mass is " in implausible(wrong)

@@ -130,7 +130,7 @@ def test_a_complete_vehicle_keeps_nothing_of_the_base(tmp_path):
     text = "\n".join(f"{name} = {value!r}".replace("'", '"') for name, value in table.items() if name != "sources")
     task = load_task(write(tmp_path / "mine.toml", f'based_on = "baseline"\n[vehicle]\n{text}'))
     assert task.vehicle.name == "hummingbird"
-    assert task.vehicle.rotor_drag is None and task.vehicle.ground_effect is None
+    assert task.vehicle.optional_rotor_drag is None and task.vehicle.ground_effect is None
 
 
 def test_a_layout_of_rotors_takes_the_place_of_the_arm(tmp_path):
@@ -184,7 +184,7 @@ def test_dials_formulas_and_inputs_are_removed_likewise(edits, gone):
 
 
 def test_an_optional_number_of_a_vehicle_is_removed_likewise():
-    assert load_task("baseline", {"vehicle.rotor_drag": "none"}).vehicle.rotor_drag is None
+    assert load_task("baseline", {"vehicle.optional_rotor_drag": "none"}).vehicle.optional_rotor_drag is None
 
 
 @pytest.mark.parametrize(

@@ -64,6 +64,12 @@ def make_network(key: jax.Array, sizes: Sequence[int], last_gain: float) -> Netw
     )
 
 
+def with_output(network: Network, value: Any) -> Network:
+    """The network with the same bias for each of its outputs."""
+    *others, last = network.biases
+    return dataclasses.replace(network, biases=(*others, jnp.full_like(last, value)))
+
+
 @pytree
 class Policy:
     """A learned controller: the deterministic action of its actor, squashed into [-1, 1].

@@ -15,7 +15,8 @@ from flytune.errors import BadInput, Diverged
 from flytune.evaluation.flights import Flights
 from flytune.evaluation.margins import CHUNK, largest_speed_bound, recorded_margins
 from flytune.kernels.programs import program
-from flytune.physics.dynamics import CONTROL_PERIOD
+from flytune.physics.dynamics import no_pending_actions
+from flytune.physics.rotors import hover_action
 from flytune.physics.vehicle import Vehicle
 from flytune.runs.find import FoundController
 from flytune.simulation.environment import Episode, begin, hold, is_crashed
@@ -73,7 +74,8 @@ def fly(
     starts_name = "own" if own else initial_conditions
     _check_arguments(trials, seed, "clear" if own else starts_name, duration)
     _check_controller(controller)
-    steps = round(duration / CONTROL_PERIOD)
+    period = task.vehicle.control_period
+    steps = round(duration / period)
     initial_state = initial_conditions if own else EVALUATION_INITIAL_STATES[initial_conditions]
     if problem := initial_state.problem() or initial_state.problem_around(task.target):
         raise BadInput(f"starts {starts_name}: {problem}")
@@ -88,7 +90,7 @@ def fly(
     along = settings_along(controller, family, steps + 1) if isinstance(controller, ScheduledPolicy) else {}
     trajectories = VehicleStates.from_rows(np.ascontiguousarray(states.transpose(2, 0, 1)))
     return Flights(
-        time=np.arange(steps + 1) * CONTROL_PERIOD,
+        time=np.arange(steps + 1) * period,
         **{field: getattr(trajectories, field) for field in WIDTHS},
         action=np.ascontiguousarray(actions.transpose(2, 0, 1)),
         crashed=np.asarray(record.crashed),
@@ -190,7 +192,7 @@ def rollout_trials(
     record, given, finite = _rollout_on_device(simulator.physics, controller, task, starts, noise_keys, steps)
     if not np.all(finite):
         trial, step = np.argwhere(~np.asarray(finite).T)[0]
-        raise _not_finite(controller, name, given[step, trial], trial, step)
+        raise _not_finite(controller, name, given[step, trial], trial, step * task.vehicle.control_period)
     return record
 
 
@@ -209,7 +211,7 @@ def _rollout_on_host(
         memory, action, given, finite = _decide(controller, memory, seen)
         if not np.all(finite):
             trial = int(np.argmin(finite))
-            raise _not_finite(controller, name, given[trial], trial, index)
+            raise _not_finite(controller, name, given[trial], trial, index * task.vehicle.control_period)
         moved = environment.step(np.asarray(action), _noise(noise_keys, index + 1))
         seen, crashed = environment.observation, moved.crashed
         states.append(environment.states.T)
@@ -246,9 +248,9 @@ def _episodes(task: Task, starts: jax.Array) -> jax.Array:
 
 def _started(task: Task, starts: jax.Array) -> Episode:
     def one(numbers: jax.Array) -> Episode:
-        state = state_from(numbers, jnp.zeros((task.vehicle.action_latency_steps, 4)))
+        state = state_from(numbers, no_pending_actions(task.vehicle))
         crashed = is_crashed(task, state)
-        episode = begin(state)
+        episode = begin(task.vehicle, state)
         return dataclasses.replace(episode, steps=jnp.where(crashed, -1, episode.steps))
 
     return jax.vmap(one, in_axes=-1, out_axes=-1)(starts)
@@ -271,7 +273,7 @@ def _rollout_on_device(
         parts.append([np.asarray(each) for each in part])
     states, actions, given, finite = (np.concatenate(each) for each in zip(*parts, strict=True))
     states = np.concatenate([np.asarray(starts)[None], states])
-    actions = np.concatenate([np.zeros_like(actions[:1]), actions])
+    actions = np.concatenate([np.full_like(actions[:1], float(hover_action(task.vehicle))), actions])
     return Record(states, actions, np.asarray(episodes.steps) < 0), given, finite
 
 
@@ -334,10 +336,10 @@ def _decide(controller: Any, memory: Any, seen: jax.Array) -> tuple[Any, jax.Arr
     return memory, jnp.clip(given, -1.0, 1.0), given, finite
 
 
-def _not_finite(controller: Any, name: str, action: Any, trial: int | np.integer, step: int | np.integer) -> Diverged:
+def _not_finite(controller: Any, name: str, action: Any, trial: Any, time: float) -> Diverged:
     if failure := getattr(controller, "failure", None):  # of an ONNX model that was stopped in flight
         return Diverged(f"{name or 'controller'}: {failure}")
     return Diverged(
         f"{name or 'controller'}: action {action} is not finite in trial {trial} "
-        f"at {step * CONTROL_PERIOD:.2f} s, on a finite observation."
+        f"at {time:.2f} s, on a finite observation."
     )

@@ -42,6 +42,13 @@ def exponential(rotation: Components) -> Components:
     return (*scale(sine, rotation), cosine)
 
 
+def rotate(quaternion: Components, vector: Components) -> Components:
+    """A vector of three, turned by a unit quaternion: v + 2 w (u x v) + 2 u x (u x v), u its vector part."""
+    axis, w = quaternion[:3], quaternion[3]
+    turned = scale(2, cross(axis, vector))
+    return add(vector, scale(w, turned), cross(axis, turned))
+
+
 def vertical_axis(quaternion: Components) -> Components:
     """The body's z axis in the inertial frame, R(q) [0, 0, 1]: the direction of the thrust."""
     x, y, z, w = quaternion

@@ -101,7 +101,7 @@ def train(
             train_state = method.warm_start(task, train_state, start.policy, start.critic)
         if directory is not None and resume:
             train_state, rows = directory.resume(train_state)
-        settings = method.settings(task)
+        settings = method.settings_at_rate(task)
         clock = Clock(f"{task.name}  {trainer}  seed {seed}", settings, rows)
         saved = time.monotonic()
         with EventLog(out, rows) if tensorboard and out is not None else contextlib.nullcontext() as log:
