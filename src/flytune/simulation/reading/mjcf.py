@@ -9,7 +9,7 @@ import numpy as np
 from flytune.errors import BadInput, require
 from flytune.physics.found_vehicle import TO_MEASURE, FoundVehicle
 from flytune.simulation.reading import markup
-from flytune.simulation.reading.bodies import Body, Pose
+from flytune.simulation.reading.bodies import Body, Pose, combined
 from flytune.simulation.reading.rotors import Rotor, check_four, frame_tables
 
 ROTORS = 'four sites, each with an actuator <motor site=... gear="0 0 1 0 0 k">, k the torque over thrust in m'
@@ -58,16 +58,16 @@ def read_mjcf(path: Path) -> FoundVehicle:
     root = roots.pop()
     base = Pose(data.xpos[root].copy(), data.xmat[root].reshape(3, 3).copy()).inverse()
     actuators = [_actuator(mujoco, model, data, base, index) for index in sited]
-    lifting = _one_per_site(file, [each for each in actuators if np.linalg.norm(each.force) > SMALL])
-    frames = {each.site: base @ _site(data, each.site) for each in lifting}
-    turning = [each for each in actuators if np.linalg.norm(each.force) <= SMALL]
-    _check_rotors(file, lifting, turning, frames)
+    pushing = [each for each in actuators if abs(each.force[2]) > SMALL]
+    frames = {each.site: base @ _site(data, each.site) for each in actuators}
+    lifting = _apart_from_centre(pushing, frames, bodies := _bodies(model, data, base, root))
+    _check_rotors(file, lifting, [each for each in actuators if each not in lifting])
     ratios = [_ratio(each) for each in lifting]
     rotors = [
         Rotor(each.name, Pose(frames[each.site].position, _along(each.force)), int(np.sign(ratio)))
         for each, ratio in zip(lifting, ratios, strict=True)
     ]
-    table, notes = frame_tables(file, _bodies(model, data, base, root), rotors)
+    table, notes = frame_tables(file, bodies, rotors)
     values, sources, hints = _numbers(file, model, table["mass"], lifting, ratios)
     if radius := _radius(mujoco, model, data, lifting):
         values["propeller_radius"] = radius
@@ -78,6 +78,9 @@ def read_mjcf(path: Path) -> FoundVehicle:
         ),
         "propeller_radius": f"{file}, shape at the rotors",
     }
+    unread = [each.name for each in actuators if each not in lifting]
+    if unread:
+        notes.append(f"actuators {', '.join(unread)} are not read")
     if model.opt.density or model.opt.viscosity:
         notes.append("the drag that MuJoCo computes from density, viscosity and shapes is not read")
     return FoundVehicle(file, table | values, sources, tuple(notes), hints)
@@ -103,23 +106,28 @@ def _actuator(mujoco: Any, model: Any, data: Any, base: Pose, index: int) -> Act
     return Actuator(name, site, gain * turn @ gear[:3], gain * turn @ gear[3:6], min(limits), lag)
 
 
-def _one_per_site(file: str, lifting: list[Actuator]) -> list[Actuator]:
-    sites = [each.site for each in lifting]
-    if len(set(sites)) != len(sites):
-        raise BadInput(f"{file}: two actuators push on one site. Allowed: one that pushes, for each rotor.")
-    return lifting
+def _apart_from_centre(pushing: list[Actuator], frames: dict[int, Pose], bodies: list[Body]) -> list[Actuator]:
+    """Those that push, without one at the centre of mass where four others are: it is no rotor, but a force."""
+    mass = sum(body.mass for body in bodies)
+    if len(pushing) <= 4 or not mass > 0:
+        return pushing
+    centre = combined(bodies)[1]
+    away = [float(np.linalg.norm(frames[each.site].position[:2] - centre[:2])) for each in pushing]
+    return [each for each, distance in zip(pushing, away, strict=True) if distance > 1e-6 * max(away)]
 
 
-def _check_rotors(file: str, lifting: list[Actuator], turning: list[Actuator], frames: dict[int, Pose]) -> None:
-    """Refuse a wrench on the whole body in place of rotors, and other than four rotors."""
+def _check_rotors(file: str, lifting: list[Actuator], others: list[Actuator]) -> None:
+    """Refuse a wrench on the whole body in place of rotors, other than four rotors, and two at one place."""
     if not lifting:
-        raise BadInput(f"{file}: has no motors: no actuator pushes. Missing: {ROTORS}.")
-    if len(lifting) < 4 and turning and {each.site for each in turning} <= set(frames):
-        names = ", ".join(each.name for each in (*lifting, *turning))
+        raise BadInput(f"{file}: has no motors: no actuator pushes along z. Missing: {ROTORS}.")
+    if len(lifting) < 4 and len(others) > 1:
+        names = ", ".join(each.name for each in (*lifting, *others))
         raise BadInput(
             f"{file}: has thrust and torques of the whole body ({names}) in place of rotors. Missing: {ROTORS}."
         )
-    check_four(lifting, file, "actuators that push on a site")
+    check_four(lifting, file, "actuators that push along z")
+    if len({each.site for each in lifting}) != len(lifting):
+        raise BadInput(f"{file}: two actuators push on one site. Allowed: one that pushes, for each rotor.")
 
 
 def _along(force: np.ndarray) -> np.ndarray:

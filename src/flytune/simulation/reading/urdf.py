@@ -14,12 +14,15 @@ from flytune.simulation.reading.rotors import Rotor, check_four, frame_tables, r
 PROPERTIES = {  # attribute -> field of a vehicle
     "kf": "thrust_coefficient",
     "km": "torque_coefficient",
+    "kf_linear": "thrust_linear",
+    "km_linear": "torque_linear",
     "thrust2weight": "thrust_to_weight",
     "prop_radius": "propeller_radius",
     "gnd_eff_coeff": "ground_effect",
 }
 DRAG = ("drag_coeff_xy", "drag_coeff_z")
 SPINS = (-1, 1, -1, 1)  # gym-pybullet-drones, BaseAviary: torque about z of motors 0 to 3
+PROPELLER = re.compile(r"(?:prop(?:eller)?|rotor|motor)_?(\d+)(?:_link)?")
 MOTORS = "a tag <properties kf= km= ...> as in gym-pybullet-drones, or the motor models of Gazebo"
 
 
@@ -106,13 +109,16 @@ def _with_properties(
     root: Element, properties: Element, file: str, frames: dict[str, Pose], bodies: list[Body]
 ) -> FoundVehicle:
     """The vehicle of gym-pybullet-drones."""
-    given = {name: number(text, f"{file}: properties {name}") for name, text in properties.items() if _is_used(name)}
-    spins = tuple(-spin for spin in SPINS) if root.get("name") == "racer" else SPINS
-    rotors, source, notes = _propellers(root, given, file, frames, spins)
+    used = {*PROPERTIES, *DRAG, "arm"}
+    given = {name: number(text, f"{file}: properties {name}") for name, text in properties.items() if name in used}
+    places, source, notes = _places(root, given.get("arm", 0.0), file, frames)
+    spins, told = _spins(root, properties, file)
+    rotors = [Rotor(name, place, spin) for (name, place), spin in zip(places, spins, strict=True)]
+    notes = [*notes, *told]
     table, more = frame_tables(file, bodies, rotors)
     sources = {
         **dict.fromkeys(("mass", "inertia", "products_of_inertia"), f"{file}, inertial of all links"),
-        **dict.fromkeys(("arm", "rotors"), source),
+        **dict.fromkeys(("arm", "rotors"), f"{source}; spins as gym-pybullet-drones has them" if told else source),
     }
     for name, field in PROPERTIES.items():
         if name in given:
@@ -121,47 +127,56 @@ def _with_properties(
         across, along = (given.get(name, 0.0) for name in DRAG)
         table["rotor_drag"] = [across, across, along]
         sources["rotor_drag"] = f"{file}, properties drag_coeff_xy and drag_coeff_z"
-    unused = [name for name in properties.keys() if not _is_used(name)]  # noqa: SIM118
-    if unused:
-        notes.append(f"properties {', '.join(unused)}: flytune has no such number")
+    if unused := set(properties.keys()) - used - {"spin"}:
+        notes.append(f"properties {', '.join(sorted(unused))}: flytune has no such number")
     return FoundVehicle(file, table, sources, (*notes, *more))
 
 
-def _is_used(name: str) -> bool:
-    return name in PROPERTIES or name in DRAG or name == "arm"
+def _places(
+    root: Element, arm: float, file: str, frames: dict[str, Pose]
+) -> tuple[list[tuple[str, Pose]], str, list[str]]:
+    """Name and frame of each rotor, where they come from, and notes.
 
-
-def _propellers(
-    root: Element, given: dict[str, float], file: str, frames: dict[str, Pose], spins: tuple[int, ...]
-) -> tuple[list[Rotor], str, list[str]]:
-    """The rotors, where they come from, and notes: from the links prop0 to prop3, or else from the arm."""
-    links = {
-        int(match[1]): link
-        for link in root.iter("link")
-        if (match := re.fullmatch(r"(?:prop(?:eller)?|rotor|motor)_?(\d+)(?:_link)?", link.get("name", "")))
-    }
-    note = (
-        "the spins are not in the file; they are those with which gym-pybullet-drones flies "
-        f"{'its racer' if spins != SPINS else 'it'}: {list(spins)}; look at the propellers"
-    )
-    if not links and given.get("arm", 0) > 0:
-        side = given["arm"] / math.sqrt(2)
-        places = [rotor_frame([side * x, side * y, 0]) for x, y in X_SIDES]
-        where = [Rotor(f"motor {index}", place, spins[index]) for index, place in enumerate(places)]
-        return where, f"{file}, properties arm, in x configuration", [note]
-    check_four(list(links), file, "links named prop0, prop1, ...")
-    rotors = []
-    for spin, index in zip(spins, sorted(links), strict=True):
-        link = links[index]
-        inertial = link.find("inertial")
+    They are the links prop0 to prop3 of gym-pybullet-drones, the shapes of this name that flytune writes, or, where
+    there are none, the ends of the arm in x configuration.
+    """
+    found: dict[int, tuple[str, Pose]] = {}
+    for link in root.iter("link"):
         name = link.get("name", "")
-        inner = Pose() if inertial is None else _origin(inertial, f"{file}: link {name!r}")
-        rotors.append(Rotor(f"link {name!r}", frames[name] @ inner, spin))
-    notes = [note]
-    reach = max(math.hypot(*rotor.frame.position[:2]) for rotor in rotors)
-    if "arm" in given and abs(given["arm"] - reach) > 1e-6 * reach:
-        notes.append(f"properties arm {given['arm']:g} m is not used; the links place the rotors {reach:.6g} m out")
-    return rotors, f"{file}, links prop0 to prop3; spins as in gym-pybullet-drones", notes
+        if match := PROPELLER.fullmatch(name):
+            inertial = link.find("inertial")
+            inner = Pose() if inertial is None else _origin(inertial, f"{file}: link {name!r}")
+            found[int(match[1])] = (f"link {name!r}", frames[name] @ inner)
+        for shape in link.iter("visual"):
+            if match := PROPELLER.fullmatch(shape.get("name", "")):
+                where = f"shape {shape.get('name')!r}"
+                found.setdefault(int(match[1]), (where, frames[name] @ _origin(shape, f"{file}: {where}")))
+    if not found and arm > 0:
+        side = arm / math.sqrt(2)
+        ends = [(f"motor {index}", rotor_frame([side * x, side * y, 0])) for index, (x, y) in enumerate(X_SIDES)]
+        return ends, f"{file}, properties arm, in x configuration", []
+    check_four(list(found), file, "links named prop0, prop1, ...")
+    places = [found[index] for index in sorted(found)]
+    reach = max(math.hypot(*place.position[:2]) for _, place in places)
+    notes = []
+    if arm and abs(arm - reach) > 1e-6 * reach:
+        notes.append(f"properties arm {arm:g} m is not used; the links place the rotors {reach:.6g} m out")
+    return places, f"{file}, {places[0][0]} to {places[-1][0]}", notes
+
+
+def _spins(root: Element, properties: Element, file: str) -> tuple[tuple[int, ...], list[str]]:
+    """The spins, and a note where the file does not give them."""
+    if (text := properties.get("spin")) is not None:
+        given = numbers(text, 4, f"{file}: properties spin")
+        if not set(given) <= {-1, 1}:
+            raise BadInput(f"{file}: properties spin: {text!r} is not allowed. Allowed: four times 1 or -1.")
+        return tuple(int(spin) for spin in given), []
+    is_racer = root.get("name") == "racer"
+    spins = tuple(-spin for spin in SPINS) if is_racer else SPINS
+    return spins, [
+        "the spins are not in the file; they are those with which gym-pybullet-drones flies "
+        f"{'its racer' if is_racer else 'it'}: {list(spins)}; look at the propellers"
+    ]
 
 
 def _with_motor_models(
