@@ -10,6 +10,7 @@ import tomlkit
 
 from flytune.config import document
 from flytune.config.fields import annotations, unit_text
+from flytune.errors import BadInput
 from flytune.physics.plausibility import AIR_DENSITY, Figure, figures
 from flytune.physics.vehicle import Vehicle
 
@@ -34,6 +35,10 @@ TO_MEASURE = {  # what a file may lack, and how a person gets it
     "gravity": "9.81 on Earth",
     "action_latency_steps": "time from a command to the motor's answer, in control steps; 0 where it is below one step",
 }
+ALONE = {  # fields without which the others can be checked together
+    "motor_rise_time_constant", "motor_fall_time_constant", "action_latency_steps", "action_scale", "drag", "gravity",
+    "rotors.spin",
+}  # fmt: skip
 LARGEST_SCALE = 3.0  # that the field accepts
 ASSUMED = {  # what no simulator's file holds, and the value it is flown with until it is measured
     "drag": ([0.0, 0.0, 0.0], "assumed: none, as the file gives none"),
@@ -93,12 +98,22 @@ class FoundVehicle:
         Raises:
             BadInput: a number out of its range, a frame that cannot be controlled, or figures that are not plausible.
         """
-        return document.read(Vehicle, {"name": self.name, **_filled(self.table)}, where=self.name)
+        tables = {"name": self.name, **_filled(self.table)}
+        if set(self.missing) <= ALONE:
+            return document.read(Vehicle, tables, where=self.name)
+        vehicle = document.read(Vehicle, tables, where=self.name, together=False)
+        for figure in self._known(vehicle):
+            if not figure.plausible:
+                raise BadInput(f"{self.name}: {figure.of}: not plausible: {figure.described}. Check the units.")
+        return vehicle
 
     def figures(self) -> list[Figure]:
         """The derived figures that follow from what is there."""
+        return self._known(self.vehicle)
+
+    def _known(self, vehicle: Vehicle) -> list[Figure]:
         lacking = {"arm" if name == "rotors" else name for name in self.missing}
-        return [figure for figure in figures(self.vehicle) if not lacking & set(figure.of.split(", "))]
+        return [figure for figure in figures(vehicle) if not lacking & set(figure.of.split(", "))]
 
 
 def from_table(table: dict[str, Any]) -> FoundVehicle:
@@ -109,7 +124,11 @@ def from_table(table: dict[str, Any]) -> FoundVehicle:
 
 
 def completed(found: FoundVehicle) -> FoundVehicle:
-    """What is found, with the numbers that are assumed, and the action scale at which full action is full thrust."""
+    """What is found, with the numbers that are assumed, and the action scale at which full action is full thrust.
+
+    Raises:
+        BadInput: what is found is no vehicle's.
+    """
     table, sources = dict(found.table), dict(found.sources)
     for name, (value, source) in ASSUMED.items():
         if name not in table:
@@ -121,7 +140,7 @@ def completed(found: FoundVehicle) -> FoundVehicle:
         scale = known.vehicle.top_rotor_speed_rpm / known.vehicle.hover_rotor_speed_rpm - 1
         table["action_scale"] = min(float(f"{scale:.6g}"), LARGEST_SCALE)
         sources["action_scale"] = "full action is full thrust: largest rotor speed over hover speed, less 1"
-    return dataclasses.replace(found, table=table, sources=sources)
+    return dataclasses.replace(found, table=table, sources=dict(_in_order(sources, table)))
 
 
 def text(found: FoundVehicle) -> str:

@@ -4,7 +4,7 @@ from typing import Any
 
 import jax.numpy as jnp
 
-from flytune.physics.components import Components, scale, squared_norm
+from flytune.physics.components import Components, add, cross, scale, squared_norm
 
 
 def multiply(first: Components, second: Components) -> Components:

@@ -127,7 +127,8 @@ def _properties(vehicle: Vehicle) -> str:
     drag = vehicle.rotor_drag or (None,) * 3
     given = {
         "kf": vehicle.thrust_coefficient, "kf_linear": vehicle.thrust_linear, "km": vehicle.torque_coefficient,
-        "km_linear": vehicle.torque_linear, "thrust2weight": _thrust_to_weight(vehicle),
+        "km_linear": vehicle.torque_linear, "min_rpm": vehicle.minimum_rotor_speed_rpm or None,
+        "thrust2weight": _thrust_to_weight(vehicle),
         "prop_radius": vehicle.propeller_radius, "gnd_eff_coeff": vehicle.ground_effect, "drag_coeff_xy": drag[0],
         "drag_coeff_z": drag[2],
     }  # fmt: skip

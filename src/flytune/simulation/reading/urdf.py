@@ -16,6 +16,7 @@ PROPERTIES = {  # attribute -> field of a vehicle
     "km": "torque_coefficient",
     "kf_linear": "thrust_linear",
     "km_linear": "torque_linear",
+    "min_rpm": "minimum_rotor_speed_rpm",
     "thrust2weight": "thrust_to_weight",
     "prop_radius": "propeller_radius",
     "gnd_eff_coeff": "ground_effect",
@@ -112,7 +113,7 @@ def _with_properties(
     used = {*PROPERTIES, *DRAG, "arm"}
     given = {name: number(text, f"{file}: properties {name}") for name, text in properties.items() if name in used}
     places, source, notes = _places(root, given.get("arm", 0.0), file, frames)
-    spins, told = _spins(root, properties, file)
+    spins, told = _spins(root, properties, file, [place for _, place in places])
     rotors = [Rotor(name, place, spin) for (name, place), spin in zip(places, spins, strict=True)]
     notes = [*notes, *told]
     table, more = frame_tables(file, bodies, rotors)
@@ -164,8 +165,8 @@ def _places(
     return places, f"{file}, {places[0][0]} to {places[-1][0]}", notes
 
 
-def _spins(root: Element, properties: Element, file: str) -> tuple[tuple[int, ...], list[str]]:
-    """The spins, and a note where the file does not give them."""
+def _spins(root: Element, properties: Element, file: str, places: list[Pose]) -> tuple[tuple[int, ...], list[str]]:
+    """The spins, and a note where the file does not give them; 0 where those of gym-pybullet-drones cannot be meant."""
     if (text := properties.get("spin")) is not None:
         given = numbers(text, 4, f"{file}: properties spin")
         if not set(given) <= {-1, 1}:
@@ -173,6 +174,10 @@ def _spins(root: Element, properties: Element, file: str) -> tuple[tuple[int, ..
         return tuple(int(spin) for spin in given), []
     is_racer = root.get("name") == "racer"
     spins = tuple(-spin for spin in SPINS) if is_racer else SPINS
+    around = [math.atan2(place.position[1], place.position[0]) for place in places]
+    order = [index for _, index in sorted(zip(around, range(4), strict=True))]
+    if any(spins[one] == spins[other] for one, other in zip(order, order[1:] + order[:1], strict=True)):
+        return (0, 0, 0, 0), []
     return spins, [
         "the spins are not in the file; they are those with which gym-pybullet-drones flies "
         f"{'its racer' if is_racer else 'it'}: {list(spins)}; look at the propellers"
