@@ -10,7 +10,7 @@ from typing import Annotated, Literal
 from cyclopts import App, CycloptsError, Parameter
 
 import flytune
-from flytune.cli import bench, evaluate, export, judge, reproduce, response_map, rules, show, train, tune
+from flytune.cli import bench, evaluate, export, judge, reproduce, response_map, rules, show, train, tune, vehicle
 from flytune.cli.refusal import refusal
 from flytune.errors import BadInput, FlytuneError, check_installed
 
@@ -28,6 +28,7 @@ COMMANDS = (
     export.export,
     show.list,
     show.show,
+    vehicle.vehicle,
     bench.bench,
 )
 Shell = Annotated[Literal["bash", "zsh", "fish"], Parameter(name="SHELL", help="the shell that shall complete")]

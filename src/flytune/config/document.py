@@ -72,8 +72,14 @@ def parse(text: str, where: str) -> dict[str, Any]:
         raise BadInput(f"{where}: is not valid TOML: {error}.") from None
 
 
-def read(kind: type[T], data: Mapping[str, Any], where: str = "") -> T:
+def read(kind: type[T], data: Mapping[str, Any], where: str = "", together: bool = True) -> T:
     """A dataclass made with `pytree` from nested tables, every value checked.
+
+    Args:
+        kind: the dataclass.
+        data: its tables.
+        where: the beginning of a message, for instance the file.
+        together: whether the values of the outermost table are checked together as well (its `problem`).
 
     Raises:
         BadInput: an unknown or missing key, a wrong type, a value out of range; one line that names `where`, for
@@ -85,7 +91,7 @@ def read(kind: type[T], data: Mapping[str, Any], where: str = "") -> T:
     except ValidationError as error:
         raise BadInput(prefix + _explain(kind, data, error)) from None
     for path, node in _nodes(result):
-        if problem := getattr(node, "problem", lambda: None)():
+        if (path or together) and (problem := getattr(node, "problem", lambda: None)()):
             raise BadInput(prefix + ".".join((*path, problem)))
     return result
 

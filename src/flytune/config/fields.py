@@ -85,6 +85,8 @@ def unit_text(annotation: Any, before: str = "") -> str:
     base, details = unwrap(annotation)
     if get_origin(base) is tuple:
         return unit_text(get_args(base)[0], before)
+    if is_union(base) and not any(isinstance(detail, annotated_types.Unit) for detail in details):
+        return next(filter(None, (unit_text(option, before) for option in get_args(base))), "")
     for detail in details:
         if isinstance(detail, annotated_types.Unit) and detail.unit != "1":
             return before + detail.unit

@@ -42,6 +42,14 @@ class Figure:
         low, high = (max(each, 1e-12) for each in self.usual)
         return max(0.0, math.log(low / max(self.value, 1e-12)), math.log(max(self.value, 1e-12) / high))
 
+    @property
+    def described(self) -> str:
+        """Its value with what is allowed and what is usual, in words."""
+        return (
+            f"{self.name} is {_number(self.value)}{self.unit}. Allowed: {_number(self.lowest)} to "
+            f"{_number(self.highest)}{self.unit} (usual: {self.usual[0]:g} to {self.usual[1]:g})"
+        )
+
     def __str__(self) -> str:
         return f"{self.name} {_number(self.value)}{self.unit}"
 
@@ -147,15 +155,15 @@ def implausible(vehicle: Vehicle) -> str | None:
         first = wrong[0]
         if first.name.startswith(LIFT):
             return (
-                _too_weak(vehicle) if first.value < first.lowest else f"{first.of}: {_shown(first)}. Check the units."
+                _too_weak(vehicle) if first.value < first.lowest else f"{first.of}: {first.described}. Check the units."
             )
-        return f"{first.of}: not plausible: {_shown(first)}. Check the units."
+        return f"{first.of}: not plausible: {first.described}. Check the units."
     first = next(each for each in wrong if each.name not in left)
     names = ", ".join(_field(vehicle, name) for name in slip.fields)
     values = ", ".join(_value(vehicle, name) for name in slip.fields)
     write = ", ".join(f"{_field(vehicle, name)} = {_value(changed, name)}" for name in slip.fields)
     are, they = ("is", "Is it") if len(slip.fields) == 1 else ("are", "Are they")
-    return f"{names}: {values} {are} not plausible: {_shown(first)}. {they} in {slip.unit}? Then write {write}."
+    return f"{names}: {values} {are} not plausible: {first.described}. {they} in {slip.unit}? Then write {write}."
 
 
 def _too_weak(vehicle: Vehicle) -> str:
@@ -259,13 +267,6 @@ def _value(vehicle: Vehicle, name: str) -> str:
 
 def _rounded(value: float) -> float:
     return float(f"{value:.6g}")
-
-
-def _shown(figure: Figure) -> str:
-    return (
-        f"{figure.name} is {_number(figure.value)}{figure.unit}. Allowed: {_number(figure.lowest)} to "
-        f"{_number(figure.highest)}{figure.unit} (usual: {figure.usual[0]:g} to {figure.usual[1]:g})"
-    )
 
 
 def _number(value: float) -> str:

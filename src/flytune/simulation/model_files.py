@@ -16,22 +16,24 @@ THICKNESS = 2e-3  # m, of the shapes that are drawn; they have neither mass nor 
 def urdf(vehicle: Vehicle) -> str:
     """The vehicle as URDF: one link with mass and inertia, drawn with a disc at each motor.
 
-    It has no collision shapes, and URDF has neither rotors nor drag: the caller applies the forces.
+    It has no collision shapes, and URDF has neither rotors nor drag: the caller applies the forces. The tag
+    `properties` tells the rotors as gym-pybullet-drones has them, and their spins.
     """
     (ixx, ixy, ixz), (_, iyy, iyz), (_, _, izz) = inertia_matrix(vehicle).tolist()
     side = reach(vehicle) / math.sqrt(2)
     discs = "".join(
         f"""
-    <visual>
+    <visual name="prop{motor}">
       <origin xyz="{place}" rpy="0 0 0"/>
       <geometry>
         <cylinder radius="{float(vehicle.propeller_radius)!r}" length="{THICKNESS}"/>
       </geometry>
     </visual>"""
-        for place in _motor_places(vehicle)
+        for motor, place in enumerate(_motor_places(vehicle))
     )
     return f"""<?xml version="1.0"?>
 <robot name="{_name(vehicle)}">
+  <properties {_properties(vehicle)}/>
   <link name="body">
     <inertial>
       <origin xyz="0 0 0" rpy="0 0 0"/>
@@ -118,6 +120,24 @@ def has_curves(vehicle: Vehicle) -> bool:
 
 def _motor_places(vehicle: Vehicle) -> list[str]:
     return [_numbers((x, y, 0.0)) for x, y in places(vehicle)]
+
+
+def _properties(vehicle: Vehicle) -> str:
+    """The attributes of the tag `properties`, those that the vehicle has."""
+    drag = vehicle.rotor_drag or (None,) * 3
+    given = {
+        "kf": vehicle.thrust_coefficient, "kf_linear": vehicle.thrust_linear, "km": vehicle.torque_coefficient,
+        "km_linear": vehicle.torque_linear, "min_rpm": vehicle.minimum_rotor_speed_rpm or None,
+        "thrust2weight": _thrust_to_weight(vehicle),
+        "prop_radius": vehicle.propeller_radius, "gnd_eff_coeff": vehicle.ground_effect, "drag_coeff_xy": drag[0],
+        "drag_coeff_z": drag[2],
+    }  # fmt: skip
+    told = [f'{name}="{float(value)!r}"' for name, value in given.items() if value is not None]
+    return " ".join([*told, f'spin="{" ".join(map(str, spins(vehicle)))}"'])
+
+
+def _thrust_to_weight(vehicle: Vehicle) -> float:
+    return float(vehicle.square_of_speed(vehicle.top_rotor_speed_rpm) / vehicle.hover_square)
 
 
 def _numbers(values: Iterable[float]) -> str:
