@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from flytune.control.controller import Controller
+from flytune.control.policy import check_actions_fit
 from flytune.control.schedule import ScheduledPolicy, settings_along, shown_setting
 from flytune.errors import BadInput, Diverged
 from flytune.evaluation.flights import Flights
@@ -74,6 +75,7 @@ def fly(
     starts_name = "own" if own else initial_conditions
     _check_arguments(trials, seed, "clear" if own else starts_name, duration)
     _check_controller(controller)
+    check_actions_fit(getattr(getattr(controller, "policy", controller), "about", {}), task.vehicle, name)
     period = task.vehicle.control_period
     steps = round(duration / period)
     initial_state = initial_conditions if own else EVALUATION_INITIAL_STATES[initial_conditions]

@@ -176,7 +176,7 @@ def _too_weak(vehicle: Vehicle) -> str:
             f"Allowed: above the hover speed, {hover:.0f} rpm, by 1 % or more."
         )
     return (
-        f"action_scale: {_rounded(vehicle.action_scale)} cannot lift the vehicle: full action gives "
+        f"action_scale: {_rounded(vehicle.action_scale or 0.0)} cannot lift the vehicle: full action gives "
         f"{vehicle.full_thrust_to_weight:.3g} times its weight. Allowed: {least - 1:.2g} or more."
     )
 
