@@ -17,6 +17,7 @@ def here(tmp_path, monkeypatch):
     """A folder with a model of Gazebo, which is complete, and one of gym-pybullet-drones, which lacks the lag."""
     monkeypatch.chdir(tmp_path)
     (tmp_path / "gazebo.sdf").write_text(models.sdf())
+    (tmp_path / "model.usd").write_text("#usda 1.0")
     (tmp_path / "bullet.urdf").write_text(models.urdf(properties='kf="1e-8" km="2e-10" thrust2weight="3"'))
     return tmp_path
 
@@ -105,6 +106,7 @@ def test_nothing_is_written_of_a_file_that_is_refused(here, capsys):
         (["gazebo.sdf", "--out", "none/mine.toml"], "out: none is no folder"),
         (["crazyfly"], "'crazyfly' is no vehicle. Allowed: crazyflie, "),
         (["none.toml"], "none.toml: cannot be read"),
+        (["model.usd"], "vehicle: model.usd is not allowed. Allowed: a file .toml, .urdf, .sdf or .xml, or a name."),
         (["gazebo.sdf", "--set"], "--set: there is no such option"),
     ],
 )

@@ -34,7 +34,7 @@ SLIPS = {  # the unit that is named -> the numbers as they are in that unit
     },
 }  # fmt: skip
 # the propeller radius of gym-pybullet-drones' racer is twice that of its propeller, so that inches look like cm
-AMBIGUOUS = {("racer", "Is it in inches? Then write propeller_radius")}
+AMBIGUOUS = {("racer of ten inches", "Is it in inches? Then write propeller_radius")}
 CASES = [(name, slip) for name in TABLES for slip in SLIPS if (name, slip) not in AMBIGUOUS]
 
 
@@ -42,6 +42,10 @@ def scaled(table, factors):
     """The table with some numbers in another unit."""
     changed = dict(table)
     for name, factor in factors.items():
+        if name == "arm" and "rotors" in table:
+            place = [[factor * part for part in each] for each in table["rotors"]["place"]]
+            changed["rotors"] = table["rotors"] | {"place": place}
+            continue
         value = table[name]
         changed[name] = [factor * each for each in value] if isinstance(value, list) else factor * value
     return changed
@@ -64,6 +68,8 @@ def test_a_number_in_another_unit_is_refused_and_the_unit_is_named(name, slip):
     with pytest.raises(BadInput) as caught:
         document.read(Vehicle, scaled(TABLES[name], SLIPS[slip]))
     text = str(caught.value)
+    if "rotors" in TABLES[name]:
+        slip = slip.replace("write arm", "write rotors.place")
     assert slip in text and "Allowed: " in text and "\n" not in text
 
 
@@ -74,10 +80,13 @@ def test_what_the_message_says_to_write_is_accepted(name, slip):
         document.read(Vehicle, table)
     written = str(caught.value).split("Then write ")[1].rstrip(".")
     # "a = 1, b = [1, 2]" as lines of TOML
-    names = [each for each in TABLES["crazyflie"] if f"{each} = " in written]
+    names = [each for each in (*TABLES["crazyflie"], "rotors.place") if f"{each} = " in written]
     for field in names:
         written = written.replace(f", {field} = ", f"\n{field} = ")
-    vehicle = document.read(Vehicle, table | document.parse(written, "message"))
+    edits = document.parse(written, "message")
+    if "rotors" in edits:
+        edits["rotors"] = table["rotors"] | edits["rotors"]
+    vehicle = document.read(Vehicle, table | edits)
     assert vehicle.mass == pytest.approx(TABLES[name]["mass"], rel=1e-5)
     assert vehicle.thrust_coefficient == pytest.approx(TABLES[name]["thrust_coefficient"], rel=1e-5)
 

@@ -1,6 +1,7 @@
 """`flytune vehicle`."""
 
 import json
+import os
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -52,6 +53,8 @@ def _find(source: str) -> "FoundVehicle":
 
     if source.lower().endswith(SUFFIXES):
         return read_model(Path(source).expanduser())
+    if not source.endswith(".toml") and os.path.isfile(source):
+        raise BadInput(f"vehicle: {source} is not allowed. Allowed: a file .toml, .urdf, .sdf or .xml, or a name.")
     return from_table(vehicle_table(source))
 
 

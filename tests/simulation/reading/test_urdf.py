@@ -13,6 +13,8 @@ from flytune.physics.vehicle import load_vehicle
 from flytune.simulation.model_files import urdf
 from flytune.simulation.reading import read_model
 
+XACRO = 'xmlns:xacro="http://www.ros.org/wiki/xacro"'
+
 
 @pytest.fixture
 def read(tmp_path):
@@ -48,6 +50,10 @@ def test_motors_in_the_order_of_the_x_configuration_give_an_arm(read):
     side = 0.1
     found = read(models.urdf(links=((side, -side), (-side, -side), (-side, side), (side, side))))
     assert found.table["arm"] == pytest.approx(side * np.sqrt(2), rel=1e-11) and "rotors" not in found.table
+
+
+def test_a_file_that_xacro_made_is_read_though_it_still_names_xacro(read):
+    assert read(models.urdf().replace("<robot", f"<robot {XACRO}")).table == read(models.urdf()).table
 
 
 def test_a_racer_spins_the_other_way_as_gym_pybullet_drones_flies_it(read):
@@ -136,10 +142,7 @@ def test_a_layout_that_flytune_writes_is_read_back(read, name):
         (models.urdf(more='<link name="loose"/>'), "links are no tree"),
         (models.urdf(links=((1.0, 0), (1.1, 0.1), (1, 0.1), (1.1, 0))), "from the centre of mass"),
         (models.urdf().replace('xyz="0.1 -0.12 0"', 'xyz="0.1 0"'), "origin xyz: '0.1 0' is not allowed"),
-        (
-            models.urdf().replace("<robot", '<robot xmlns:xacro="http://www.ros.org/wiki/xacro"'),
-            "is a template of xacro",
-        ),
+        (models.urdf(more=f"<xacro:arm {XACRO}/>"), "is a template of xacro"),
     ],
 )
 def test_a_file_that_is_no_vehicle_is_refused_in_one_line(read, text, said):

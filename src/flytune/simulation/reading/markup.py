@@ -23,12 +23,13 @@ def parse(path: Path) -> Element:
         raise BadInput(f"{path}: has a DOCTYPE or entities, which are not read. Remove them.")
     if "{%" in text:
         raise BadInput(f"{path}: is a template of jinja. Give the file that it makes, for PX4 with its jinja_gen.py.")
-    if "ros.org/wiki/xacro" in text:
-        raise BadInput(f"{path}: is a template of xacro. Give the file that it makes: xacro {path.name} > model.urdf")
     try:
-        return ElementTree.fromstring(text)
+        root = ElementTree.fromstring(text)
     except (ElementTree.ParseError, ValueError) as error:
         raise BadInput(f"{path}: is not valid XML: {error}.") from None
+    if any("ros.org/wiki/xacro}" in str(each.tag) for each in root.iter()):
+        raise BadInput(f"{path}: is a template of xacro. Give the file that it makes: xacro {path.name} > model.urdf")
+    return root
 
 
 def short_name(path: Path) -> str:

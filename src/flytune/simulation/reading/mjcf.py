@@ -38,9 +38,9 @@ def read_mjcf(path: Path) -> FoundVehicle:
     file = markup.short_name(path)
     try:
         model = mujoco.MjModel.from_xml_path(str(path))
-    except ValueError as error:
+    except (ValueError, RuntimeError) as error:
         raise BadInput(
-            f"{path}: MuJoCo cannot compile it: {' '.join(str(error).split())}. Files that it "
+            f"{path}: MuJoCo cannot compile it: {' '.join(str(error).split()).rstrip('.')}. Files that it "
             "names have to lie where it says."
         ) from None
     data = mujoco.MjData(model)
