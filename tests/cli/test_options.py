@@ -106,6 +106,11 @@ def test_of_two_values_of_one_path_the_last_one_counts():
     assert assignments(("a.b=1", "c=3", "a.b=2")) == {"a.b": 2, "c": 3}
 
 
+def test_a_whole_number_may_be_written_as_a_float():
+    *_, options = parsed("train", "baseline", "--steps", "1e6", "--seed", "3.0")
+    assert (options.steps, options.seed) == (1_000_000, 3) and isinstance(options.steps, int)
+
+
 def test_an_option_that_is_given_twice_counts_as_given_last():
     *_, options = parsed("evaluate", "pid", "--seed", "3", "--trials=5", "--seed", "4")
     assert (options.seed, options.trials) == (4, 5)
@@ -144,6 +149,8 @@ REFUSED = {
     "evaluate pid --world mars": "--world: 'mars' is not allowed. Allowed: flytune, pybullet, mujoco.",
     "evaluate pid --starts cloudy": "--starts: 'cloudy' is not allowed. Allowed: clear, paper.",
     "evaluate pid --trials 3.7": "--trials: '3.7' is not allowed. Allowed: a whole number.",
+    "evaluate pid --trials 1e-2": "--trials: '1e-2' is not allowed. Allowed: a whole number.",
+    "evaluate pid --trials inf": "--trials: 'inf' is not allowed. Allowed: a whole number.",
     "evaluate pid --duration soon": "--duration: 'soon' is not allowed. Allowed: a number.",
     "evaluate pid --json=3": "--json: '3' is not allowed. Allowed: the option without a value.",
     "evaluate": "CONTROLLER: a value is missing. Give CONTROLLER: a run directory,",

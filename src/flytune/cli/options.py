@@ -22,7 +22,22 @@ CONTROLLER_HELP = (
 )
 
 
-def number_reader(kind: type, allowed: str) -> Callable[[type, Sequence[Token]], Any]:
+def whole_number(text: str) -> int:
+    """The whole number of a text, which may be written as a float: 1e6, 100.0.
+
+    Raises:
+        ValueError: it is none.
+    """
+    try:
+        return int(text)
+    except ValueError:
+        number = float(text)
+        if not number.is_integer():
+            raise
+        return int(number)
+
+
+def number_reader(kind: Callable[[str], float], allowed: str) -> Callable[[type, Sequence[Token]], Any]:
     """A converter for options that are numbers: 3.7 is no whole number, and is refused instead of rounded."""
 
     def read(_: type, tokens: Sequence[Token]) -> Any:
@@ -43,7 +58,7 @@ else:
 Task = Annotated[str, Parameter(name="TASK", help=TASK_HELP)]
 Controller = Annotated[str, Parameter(name="CONTROLLER", help=CONTROLLER_HELP)]
 Controllers = Annotated[tuple[str, ...], Parameter(name="CONTROLLER", help=CONTROLLER_HELP)]
-Whole = Annotated[int, Parameter(metavar="N", converter=number_reader(int, "a whole number"))]
+Whole = Annotated[int, Parameter(metavar="N", converter=number_reader(whole_number, "a whole number"))]
 Real = Annotated[float, Parameter(converter=number_reader(float, "a number"))]
 Flag = Annotated[bool, Parameter(negative=(), show_default=False)]
 Assignments = Annotated[

@@ -7,11 +7,11 @@ from pathlib import Path
 from typing import Any
 
 from flytune.config import document, nested
-from flytune.config.fields import annotations
-from flytune.config.removal import NONE, is_named, without_none
+from flytune.config.fields import annotations, is_named
+from flytune.config.removal import NONE, without_none
 from flytune.errors import BadInput
 from flytune.physics.plausibility import summary
-from flytune.physics.vehicle import Vehicle, vehicle_table
+from flytune.physics.vehicle import Vehicle, vehicle_names, vehicle_table
 from flytune.task.following import check_given, settings_to_check
 from flytune.task.task import Task
 
@@ -141,6 +141,8 @@ def _laid_over(
                 _check_there(below, (name, key), f"{where}: ")
         if changes.get(name) == {}:
             below = {**below, name: {}}
+    for path, value in nested.leaves(changes, skip=("vehicle", "follow", *nested.LABELS)):
+        _check_table(below, path, value, f"{where}: ")
     if isinstance(vehicle := changes.get("vehicle"), dict) and "vehicle" in below and not whole_vehicle:
         changes["vehicle"] = _vehicle_over(below["vehicle"], vehicle)
     if "vehicle" in changes:  # which is laid over already
@@ -174,6 +176,21 @@ def _check_there(tables: dict[str, Any], path: tuple[str, str], prefix: str = ""
             f"{prefix}{table}.{name}: there is none that could be removed. There are: {', '.join(there) or 'none'}."
             + (f" Did you mean {table}.{hint}?" if hint else "")
         )
+
+
+def _check_table(tables: dict[str, Any], path: str, value: Any, prefix: str = "") -> None:
+    """Refuse a value in place of a table.
+
+    Raises:
+        BadInput: it is one; the line names what is in the table.
+    """
+    there = nested.look_up(tables, path)
+    if path in nested.LABELS or not isinstance(there, dict) or isinstance(value, dict) or value == NONE:
+        return
+    remove = ' "none" removes it.' if path.partition(".")[0] in NAMED else ""
+    what = f"Give one of {', '.join(vehicle_names())}, a .toml file, or edit" if path == "vehicle" else "Edit"
+    fields = ", ".join(f"{path}.{each}" for each in there if each not in nested.LABELS)
+    raise BadInput(f"{prefix}{path}: {value!r} is not allowed for a table. {what} what is in it: {fields}.{remove}")
 
 
 def _with_sources(data: dict[str, Any], file: str) -> dict[str, Any]:
@@ -258,6 +275,7 @@ def _edited(data: dict[str, Any], path: str, value: Any) -> dict[str, Any]:
     table, _, name = path.partition(".")
     if value == NONE and table in NAMED and name and "." not in name:
         _check_there(data, (table, name))
+    _check_table(data, path, value)
     data = nested.edit(data, path, value)
     owner, field = (data["vehicle"], path[len("vehicle.") :]) if path.startswith("vehicle.") else (data, path)
     if not path.startswith(("name", "sources", "vehicle.name", "vehicle.sources")):
