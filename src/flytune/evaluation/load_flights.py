@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from flytune.config.recognise import FLIGHTS, misplaced
 from flytune.errors import BadInput
 from flytune.evaluation.flights import Flights
 from flytune.evaluation.log_columns import Column, check_columns, choose_columns, units_of
@@ -64,6 +65,8 @@ def load_flights(
     aim = None if target is None else _checked_target(target)
     flights = []
     for path in map(Path, paths):
+        if line := misplaced(str(path), FLIGHTS):
+            raise BadInput(line)
         if _is_zip(path):
             flights.append(_from_npz(path, columns, aim, start, longest_gap, on_message))
         else:

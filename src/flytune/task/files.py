@@ -8,6 +8,7 @@ from typing import Any
 
 from flytune.config import document, nested
 from flytune.config.fields import annotations, is_named
+from flytune.config.recognise import TASK, VEHICLE, meant, misplaced, runs_in
 from flytune.config.removal import NONE, without_none
 from flytune.errors import BadInput
 from flytune.physics.plausibility import summary
@@ -55,16 +56,18 @@ def load_task(task: str | Path, edits: dict[str, Any] | None = None) -> Task:
     name, given = str(task), {}
     if name not in preset_names() and os.path.isfile(os.path.join(name, TASK_FILE)):
         name = os.path.join(name, TASK_FILE)
+    elif line := misplaced(name, TASK):
+        raise BadInput(f"task: {line}")
     if name in preset_names():
         data, where = _preset(name), ""
     elif name.endswith(".toml") or os.path.isfile(name):
         data, given = _from_file(Path(name))
         where = name
     else:
-        hint = document.nearest(name, preset_names())
+        hint = meant(name, preset_names(), [".toml"]) or runs_in(name)
         raise BadInput(
             f"task: {name!r} is no preset. Allowed: {', '.join(preset_names())}, a .toml file, or a run directory."
-            + (f" Did you mean {hint}?" if hint else "")
+            f"{hint}"
         )
     task_read = _read(data, where)
     check_given(task_read.follow, document.plain(task_read), given, where)
@@ -101,13 +104,15 @@ def _from_file(path: Path, above: tuple[Path, ...] = ()) -> tuple[dict[str, Any]
     data = _with_sources({"name": path.stem, **given}, str(path))
     named = isinstance(vehicle := data.get("vehicle"), str)
     if isinstance(vehicle, str):
-        data["vehicle"] = vehicle_table(vehicle, path.parent, f"{path}: ")
+        data["vehicle"] = _vehicle(vehicle, path.parent, f"{path}: ")
     if "based_on" not in data:
         return data, given
     base = data["based_on"]
     if base in preset_names():
         below, said = _preset(base), {}
     elif isinstance(base, str) and base.endswith(".toml"):
+        if line := misplaced(str(path.parent / base), TASK):
+            raise BadInput(f"{path}: based_on: {line}")
         below, said = _from_file(path.parent / base, (*above, resolved))
     else:
         hint = document.nearest(str(base), preset_names())
@@ -150,12 +155,19 @@ def _laid_over(
     return nested.overlay(below, changes)
 
 
+def _vehicle(name: str, folder: Path = Path(), where: str = "") -> dict[str, Any]:
+    """The tables of a vehicle, see `vehicle_table`; what is something else is refused with its use."""
+    if name not in vehicle_names() and (line := misplaced(str(folder / Path(name).expanduser()), VEHICLE)):
+        raise BadInput(f"{where}vehicle: {line}")
+    return vehicle_table(name, folder, where)
+
+
 def _vehicle_over(below: str | dict[str, Any], vehicle: dict[str, Any]) -> dict[str, Any]:
     """A vehicle's table laid over that of the base; one that is complete replaces it."""
     required = {field.name for field in dataclasses.fields(Vehicle) if field.default is field.default_factory}
     if required <= vehicle.keys():
         return vehicle
-    base = dict(vehicle_table(below) if isinstance(below, str) else below)
+    base = dict(_vehicle(below) if isinstance(below, str) else below)
     for one, other in (("arm", "rotors"), ("rotors", "arm")):
         if one in vehicle and other not in vehicle:
             base.pop(other, None)
@@ -238,7 +250,7 @@ def _read(data: dict[str, Any], where: str = "") -> Task:
         if nested.look_up(data, old) is not None:
             raise BadInput(f"{f'{where}: ' if where else ''}{old}: is called {new} now. Write {new} instead.")
     vehicle = data.get("vehicle")
-    complete = {**data, "vehicle": vehicle_table(vehicle)} if isinstance(vehicle, str) else data
+    complete = {**data, "vehicle": _vehicle(vehicle)} if isinstance(vehicle, str) else data
     return _at_default(document.read(Task, _without_removed(complete), where), where)
 
 
@@ -271,7 +283,7 @@ def _edited(data: dict[str, Any], path: str, value: Any) -> dict[str, Any]:
         formula = str(value) if isinstance(value, int | float) and not isinstance(value, bool) else value
         return {**data, "follow": {**data.get("follow", {}), path.removeprefix("follow."): formula}}
     if path == "vehicle" and isinstance(value, str):
-        return {**data, "vehicle": vehicle_table(value)}
+        return {**data, "vehicle": _vehicle(value)}
     table, _, name = path.partition(".")
     if value == NONE and table in NAMED and name and "." not in name:
         _check_there(data, (table, name))
