@@ -122,7 +122,7 @@ def find_statistics(model: Path) -> Path | None:
 
 
 def in_folders(model: Path) -> list[Path]:
-    """The files of statistics one folder below a model, where RL Zoo keeps them; the folder is named as the environment."""
+    """The files of statistics in the folders beside a model; RL Zoo keeps them in one named as the environment."""
     return sorted(model.parent.glob("*/vecnormalize.pkl"))
 
 
