@@ -27,7 +27,7 @@ OPTIONS = {
     "reproduce": "--trainer --seeds --steps --refined --out --json",
     "export": "CONTROLLER --format --out",
     "list": "--json",
-    "show": "TASK",
+    "show": "TASK --set",
     "bench": "WHAT --json",
     "completion": "SHELL",
 }
@@ -162,7 +162,18 @@ REFUSED = {
     "tune": "--settling-time: a value is missing. Give --settling-time S: wanted settling time, in seconds",
     "export pid --out x": "--format: a value is missing. Give --format onnx|safetensors:",
     "bench sleep": "WHAT: 'sleep' is not allowed. Allowed: all, train, simulate.",
-    "compare pid --seed 1 lqr": "'lqr': a value is not expected here. TASK and CONTROLLER stand before the options.",
+    "compare pid --seed 1 lqr": "'lqr': a value is not expected here. CONTROLLER stands before the options.",
+    "evaluate pid lqr": "'lqr': a value is not expected here. One CONTROLLER is allowed, before the options. `flytune "
+    "compare` takes several.",
+    "show a b": "'b': a value is not expected here. One TASK is allowed, before the options.",
+    "list x": "'x': a value is not expected here. list takes options alone.",
+    "judge f.csv --target 0 0 1 0": "--target: 4 values are not allowed. Allowed: one, X,Y,Z,YAW. Write --target "
+    "0,0,1,0.",
+    "judge f.csv --target -1 0": "--target: 2 values are not allowed. Allowed: one, X,Y,Z,YAW. See",
+    "evaluate pid --set target.yaw=1": "--set: is no option of evaluate. Edits of a task belong to train, tune and "
+    "show. To fly an edited task: flytune show TASK --set PATH=VALUE > FILE.toml, then --task FILE.toml.",
+    "compare pid lqr --sets x=1": "--sets: is no option of compare. Edits of a task belong",
+    "map dial --set x=1": "--set: is no option of map. Edits of a task belong to train, tune and show. See",
 }
 
 

@@ -29,7 +29,8 @@ def export(controller: PolicyName, /, *, file_format: Format, out: File) -> None
     from flytune.export.onnx import FORMAT_VALUE as ONNX
     from flytune.runs.find import find_controller, split_setting
 
-    check_file(out, mark={"onnx": ONNX, "safetensors": SAFETENSORS}[file_format].encode(), kind="a policy")
+    mark = {"onnx": ONNX, "safetensors": SAFETENSORS}[file_format].encode()
+    check_file(out, mark=mark, kind="a policy", suffixes=[f".{file_format}"])
     found = find_controller(controller)
     _, setting = split_setting(controller)
     print(export_policy(found.fixed() if setting else found, out, file_format))

@@ -83,7 +83,14 @@ def _columns(texts: tuple[str, ...]) -> dict[str, str]:
 
 
 def _target(text: str) -> list[float]:
+    """The numbers of a text such as 0,0,1,0 or "[0, 0, 1, 0]"."""
     try:
-        return [float(part) for part in text.split(",")]
+        numbers = [float(part) for part in text.strip("[]() ").replace(",", " ").split()]
     except ValueError:
-        raise BadInput(f"target: {text!r} is not allowed. Allowed: four numbers x,y,z,yaw in m and rad.") from None
+        numbers = []
+    if len(numbers) != 4:
+        raise BadInput(
+            f"target: {text!r} is not allowed. Allowed: four numbers x,y,z,yaw in m and rad, with commas between them: "
+            "--target 0,0,1,0."
+        )
+    return numbers

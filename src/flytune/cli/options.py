@@ -37,6 +37,9 @@ def whole_number(text: str) -> int:
         return int(number)
 
 
+FILES = (".html", ".htm", ".json", ".jsonl", ".npz", ".csv", ".onnx", ".safetensors", ".zip", ".toml")  # no folders
+
+
 def number_reader(kind: Callable[[str], float], allowed: str) -> Callable[[type, Sequence[Token]], Any]:
     """A converter for options that are numbers: 3.7 is no whole number, and is refused instead of rounded."""
 
@@ -140,8 +143,9 @@ def check_folder(folder: Path | None, controller: str = "") -> None:
     """Refuse a folder that cannot be written, or that holds the run of another controller, before anything flies.
 
     Raises:
-        BadInput: it is a file, or another run.
+        BadInput: it is a file, has the name of one, or is another run.
     """
+    check_folder_name(folder)
     if folder is None or not os.path.exists(folder):
         return
     if not os.path.isdir(folder):
@@ -149,6 +153,19 @@ def check_folder(folder: Path | None, controller: str = "") -> None:
     own = os.path.isdir(controller) and os.path.samefile(folder, controller)
     if not own and os.path.exists(folder / "run.json"):
         raise BadInput(f"out: {folder} is the run directory of another training. Give another folder.")
+
+
+def check_folder_name(folder: Path | None) -> None:
+    """Refuse a new folder with the name of a file that flytune writes.
+
+    Raises:
+        BadInput: its name is one.
+    """
+    if folder is not None and folder.suffix in FILES and not os.path.exists(folder):
+        raise BadInput(
+            f"out: {folder} is the name of a file. Allowed: a folder, which may be new. Did you mean "
+            f"{folder.with_suffix('')}?"
+        )
 
 
 def check_flights(*files: Path) -> None:
@@ -160,4 +177,4 @@ def check_flights(*files: Path) -> None:
     from flytune.evaluation.flights import MARK
 
     for file in files:
-        check_file(file, "flights", mark=MARK, kind="a file of flights")
+        check_file(file, "flights", mark=MARK, kind="a file of flights", suffixes=[".npz"])

@@ -8,7 +8,7 @@ from typing import Annotated, Any
 
 from cyclopts import Parameter
 
-from flytune.cli.options import AsJson, Edits, Flag, Folder, Task, TrainerName, Whole, assignments
+from flytune.cli.options import AsJson, Edits, Flag, Folder, Task, TrainerName, Whole, assignments, check_folder_name
 from flytune.errors import BadInput
 from flytune.training.trainer import DEFAULT_TRAINER, TRAINERS, find_trainer
 
@@ -53,6 +53,7 @@ def train(
     from flytune.training.loop import train
     from flytune.training.progress import show_progress
 
+    check_folder_name(out)
     changes = assignments(edits)
     find_trainer(trainer).check_edits(changes)
     wanted = load_task(task, changes)

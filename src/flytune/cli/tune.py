@@ -9,7 +9,17 @@ from typing import Annotated, Any, Literal
 
 from cyclopts import Parameter
 
-from flytune.cli.options import AsJson, Edits, EveryTaskTrainerName, Flag, Folder, Real, Whole, assignments
+from flytune.cli.options import (
+    AsJson,
+    Edits,
+    EveryTaskTrainerName,
+    Flag,
+    Folder,
+    Real,
+    Whole,
+    assignments,
+    check_folder_name,
+)
 from flytune.errors import BadInput, Unmet
 from flytune.training.trainer import DEFAULT_TRAINER, trainer_names
 
@@ -113,6 +123,7 @@ def tune(task: TuneTask = None, /, *, options: TuneOptions, as_json: AsJson = Fa
     from flytune.training.progress import show_progress
     from flytune.tuning.tune import tune
 
+    check_folder_name(options.out)
     with show_progress() as on_progress:
         result = tune(
             **options.arguments(),

@@ -120,6 +120,10 @@ def _from_npz(
     missing = [name for name in ("time", "position") if name not in arrays]
     missing += [] if {"yaw", "attitude"} & arrays.keys() else ["yaw"]
     missing += ["target_position"] if aim is None and "target_position" not in arrays else []
+    if missing == ["target_position"]:
+        raise BadInput(
+            f"{path}: has no array target_position. Found: {', '.join(arrays)}. Give --target x,y,z,yaw in m and rad."
+        )
     if missing:
         raise BadInput(f"{path}: has no array {', '.join(missing)}. Found: {', '.join(arrays)}. {allowed}")
     for name, values in arrays.items():
