@@ -5,6 +5,7 @@ from typing import Annotated, Literal
 
 from cyclopts import Parameter
 
+from flytune.cli.completion import controllers
 from flytune.config.files import check_file
 
 PolicyName = Annotated[
@@ -13,6 +14,7 @@ PolicyName = Annotated[
         name="CONTROLLER",
         help="a run directory, a policy file (.safetensors, .onnx, .zip), or a policy that ships; with a setting of "
         "its dials (dial@speed=0.5), the policy of this setting alone",
+        completer=controllers,
     ),
 ]
 Format = Annotated[

@@ -7,6 +7,7 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
+from flytune.cli.completion import columns as quantities
 from flytune.cli.options import AsJson, Assignments, Real
 from flytune.errors import BadInput
 
@@ -29,6 +30,7 @@ def judge(
         Parameter(
             name="--columns",
             metavar="NAME=COLUMN",
+            completer=quantities,
             help="the columns of a log: time=stamp[ms] x=pos_n[mm] z=-down yaw=0 ...; NAME is one of time, x, y, z, "
             "yaw, qx, qy, qz, qw, vx, vy, vz, target_x, target_y, target_z, target_yaw, trial (default: found by their "
             "names)",

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from cyclopts import Parameter, Token
 
+from flytune.cli.completion import completed_by, controllers, edits, tasks
 from flytune.config.files import check_file
 from flytune.errors import BadInput
 from flytune.training.trainer import trainer_names
@@ -58,9 +59,9 @@ else:
     TrainerName = Literal[trainer_names()]
     EveryTaskTrainerName = Literal[trainer_names(every_task=True)]
 
-Task = Annotated[str, Parameter(name="TASK", help=TASK_HELP)]
-Controller = Annotated[str, Parameter(name="CONTROLLER", help=CONTROLLER_HELP)]
-Controllers = Annotated[tuple[str, ...], Parameter(name="CONTROLLER", help=CONTROLLER_HELP)]
+Task = Annotated[str, Parameter(name="TASK", help=TASK_HELP), completed_by(tasks)]
+Controller = Annotated[str, Parameter(name="CONTROLLER", help=CONTROLLER_HELP), completed_by(controllers)]
+Controllers = Annotated[tuple[str, ...], Parameter(name="CONTROLLER", help=CONTROLLER_HELP), completed_by(controllers)]
 Whole = Annotated[int, Parameter(metavar="N", converter=number_reader(whole_number, "a whole number"))]
 Real = Annotated[float, Parameter(converter=number_reader(float, "a number"))]
 Flag = Annotated[bool, Parameter(negative=(), show_default=False)]
@@ -68,7 +69,7 @@ Assignments = Annotated[
     tuple[str, ...], Parameter(metavar="PATH=VALUE", consume_multiple=(1, None), negative=(), show_default=False)
 ]
 Folder = Annotated[Path | None, Parameter(name="--out", metavar="DIR")]
-Edits = Annotated[Assignments, Parameter(name="--set")]
+Edits = Annotated[Assignments, Parameter(name="--set"), completed_by(edits)]
 AsJson = Annotated[Flag, Parameter(name="--json", help="print one JSON object instead, and messages to standard error")]
 
 
@@ -83,6 +84,7 @@ class FlightOptions:
             metavar="TASK",
             help=f"the task to fly: {TASK_HELP} (default: the one it was trained for; of several controllers, that of "
             "the first learned policy)",
+            completer=tasks,
         ),
     ] = None
     simulator: Annotated[

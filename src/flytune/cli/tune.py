@@ -9,6 +9,7 @@ from typing import Annotated, Any, Literal
 
 from cyclopts import Parameter
 
+from flytune.cli.completion import tasks
 from flytune.cli.options import (
     AsJson,
     Edits,
@@ -114,6 +115,7 @@ TuneTask = Annotated[
     Parameter(
         name="TASK",
         help="the task to begin with, a preset or a TOML file (default: the known task that settles nearest)",
+        completer=tasks,
     ),
 ]
 

@@ -69,7 +69,7 @@ def meant(name: str, names: Iterable[str], suffixes: Iterable[str]) -> str:
     found = next((str(each) for each in paths if os.path.exists(each)), None) or nearest(name, names)
     if found is None:
         for folder in (path.parent, *([Path("runs")] if path.name == name else [])):
-            there = [each for each in _entries(folder) if _is_run(folder / each) or Path(each).suffix in suffixes]
+            there = [each for each in _entries(folder) if is_run(folder / each) or Path(each).suffix in suffixes]
             if near := nearest(path.name, there):
                 found = str(folder / near)
                 break
@@ -78,19 +78,29 @@ def meant(name: str, names: Iterable[str], suffixes: Iterable[str]) -> str:
 
 def runs_in(folder: str | Path) -> str:
     """A hint at the run directories in a folder, after a space; or nothing."""
-    runs = [str(Path(folder) / each) for each in _entries(Path(folder)) if _is_run(Path(folder) / each)]
+    runs = [str(Path(folder) / each) for each in _entries(Path(folder)) if is_run(Path(folder) / each)]
     return f" It holds the runs {', '.join(runs[:MOST])}{', ...' * (len(runs) > MOST)}." if runs else ""
+
+
+def shipped(kind: str) -> list[str]:
+    """The names of the tasks, controllers or vehicles that ship with flytune."""
+    return sorted(name for folder, each in SHIPPED.items() if each == kind for name in _shipped(folder))
+
+
+def is_run(path: str | Path) -> bool:
+    """Whether a path is a run directory."""
+    return os.path.isfile(os.path.join(path, "run.json"))
 
 
 def _kinds(name: str) -> Iterator[tuple[str, str]]:
     """The kinds of a name or path, each with the words for it."""
     path = Path(name)
     if os.path.isdir(name):
-        if _is_run(path):
+        if is_run(path):
             yield "a run directory", "a run directory"
         return
     if os.path.isfile(name):
-        if path.name in RUN_RECORDS and _is_run(path.parent):
+        if path.name in RUN_RECORDS and is_run(path.parent):
             yield "a record", f"a record of the run {path.parent}"
         if path.suffix == ".toml":
             kind = _kind_of_toml(path)
@@ -116,20 +126,20 @@ def _kind_of_toml(path: Path) -> str | None:
 def _policies_for(task: str) -> str:
     """A hint at the policies of a task: the run that it belongs to, a run that is named after it, or one that ships."""
     folder, name = Path(task).parent, Path(task).stem
-    if os.path.isfile(task) and _is_run(folder):
+    if os.path.isfile(task) and is_run(folder):
         return f"Did you mean its run, {folder}? "
     found = [each for each in _shipped("runs/policies") if each == f"{name}-refined" and "@" not in each]
     found += [
-        f"runs/{each}" for each in _entries(Path("runs")) if each.startswith(f"{name}-") and _is_run(f"runs/{each}")
+        f"runs/{each}" for each in _entries(Path("runs")) if each.startswith(f"{name}-") and is_run(f"runs/{each}")
     ]
     return f"Did you mean {' or '.join(found[:MOST])}? " if found else ""
 
 
 def _shipped(folder: str) -> list[str]:
-    """The names of the data files in a folder of the package; `NAME@apg` of a policy is also called NAME."""
+    """The names of the data files in a folder of the package; a policy by the default trainer is called by its task."""
     home = resources.files("flytune") / folder
     stems = [each.name.rpartition(".")[0] for each in home.iterdir()] if home.is_dir() else []
-    return sorted({name for stem in stems if stem for name in (stem, stem.partition("@")[0])})
+    return sorted({stem.removesuffix("@apg") for stem in stems if stem})
 
 
 def _entries(folder: Path) -> list[str]:
@@ -137,7 +147,3 @@ def _entries(folder: Path) -> list[str]:
         return sorted(os.listdir(folder))
     except OSError:
         return []
-
-
-def _is_run(path: str | Path) -> bool:
-    return os.path.isfile(os.path.join(path, "run.json"))
