@@ -93,6 +93,9 @@ def test_defaults_and_units_are_shown(capsys):
     assert "number of trials [default: 100]" in shown
     assert "--duration S length of each trial, in seconds (default: the task's own)" in shown
     assert "[choices: flytune, pybullet, mujoco] [default: flytune]" in shown
+    main(["tune", "--help"])
+    shown = " ".join(capsys.readouterr().out.replace("│", " ").split())
+    assert "[choices: position, x, y, z, yaw] [default: position]" in shown
 
 
 def test_assignments_may_follow_one_option_or_repeat_it():

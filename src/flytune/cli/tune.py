@@ -54,6 +54,7 @@ class TuneOptions:
         Parameter(
             consume_multiple=(1, None),
             negative=(),
+            show_default=", ".join,
             help="the axis whose response counts; or several: the first one settles in the time asked for, the others "
             "settle no later",
         ),
