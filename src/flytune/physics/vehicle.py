@@ -66,7 +66,12 @@ class Vehicle:
         Annotated[Real, Gt(0), Unit("kg m^2")],
         Annotated[Real, Gt(0), Unit("kg m^2")],
     ]  # principal moments about x, y, z
-    arm: Annotated[Real | None, Gt(0), Unit("m")] = None  # x configuration: from the centre to each motor
+    arm: Annotated[  # x configuration
+        Real | None,
+        Gt(0),
+        Unit("m"),
+        doc("from the centre of mass to each motor, half of a diagonal from motor to motor"),
+    ] = None
     rotors: Rotors | None = None  # another layout, in place of `arm`
     thrust_coefficient: Annotated[Real, Gt(0), Unit("N/rpm^2")]
     torque_coefficient: Annotated[Real, Gt(0), Unit("N m/rpm^2")]
