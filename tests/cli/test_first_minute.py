@@ -1,9 +1,11 @@
 """The first minute at the command line: help, version, what there is, suggestions and completion."""
 
 import json
+import re
 import shlex
 import subprocess
 from importlib import metadata
+from pathlib import Path
 
 import pytest
 from tests.command import COMMAND, flytune, refused
@@ -63,6 +65,10 @@ def test_the_list_names_everything_that_commands_take_with_a_line_each(capsys):
     text = capsys.readouterr().out
     assert all(f"  {name} " in text for entries in names.values() for name in entries)
     assert all(line in text for line in lines)
+    folders = dict(re.findall(r"^(\w+) \(files in (.*)\)$", text, re.MULTILINE))
+    for kind, folder in folders.items():
+        assert {f"{name}.toml" for name in names[kind]} <= {file.name for file in Path(folder).iterdir()}
+    assert set(folders) == {"presets", "vehicles"}
 
 
 def test_every_name_in_the_list_can_be_used(capsys):

@@ -22,15 +22,16 @@ def show(
 
 def list(*, as_json: AsJson = False) -> None:
     """Print the names that commands take: presets, vehicles, policies, controllers and simulators."""
-    from flytune.runs.catalogue import catalogue
+    from flytune.runs.catalogue import catalogue, folders
 
-    known = catalogue()
+    known, files = catalogue(), folders()
     if as_json:
         print(json.dumps({"schema": 1, **known}))
         return
     width = max(len(name) for names in known.values() for name in names)
     sections = (
-        f"{kind}\n" + "\n".join(f"  {name:<{width}}  {about}" for name, about in names.items())
+        f"{kind}{f' (files in {files[kind]})' if kind in files else ''}\n"
+        + "\n".join(f"  {name:<{width}}  {about}" for name, about in names.items())
         for kind, names in known.items()
         if names
     )
