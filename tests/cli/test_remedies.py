@@ -134,6 +134,8 @@ REMEDIES = [  # what is typed, what the message says, and what is typed after re
     (["export", "mine", "--format", "safetensors", "--out", "p.onnx"], r"Did you mean (\S+)\?", swap("p.onnx", None)),
     (["evaluate", "baseline", *FLY], r"Did you mean ([\w-]+)\?", swap("baseline", None)),
     (["evaluate", "pids", *FLY], r"Did you mean (\w+)\?", swap("pids", None)),
+    (["show", "tsk.toml"], r"no such file\. Did you mean (\S+)\?", swap("tsk.toml", None)),
+    (["evaluate", "pid@texbook", *FLY], r"Did you mean (\w+)\?", swap("pid@texbook", "pid@textbook")),
     (["evaluate", "known", *FLY], r"Did you mean (\S+)\?", swap("known", None)),
     (["evaluate", "runs/knwon", *FLY], r"Did you mean (\S+)\?", swap("runs/knwon", None)),
     (["evaluate", "mine/task.toml", *FLY], r"Did you mean its run, (\w+)\?", swap("mine/task.toml", None)),

@@ -86,14 +86,21 @@ def test_of_what_is_not_known_nothing_is_said(here, name):
 
 
 @pytest.mark.parametrize(
-    ("typed", "hint"),
+    ("typed", "wanted", "hint"),
     [
-        ("mine", "runs/mine"), ("miner", "runs/mine"), ("runs/mien", "runs/mine"), ("pids", "pid"), ("p", "p.onnx"),
-        ("p.onx", "p.onnx"), ("quux", ""), ("nowhere/mine", ""), ("n" * 5000, ""),
+        ("mine", CONTROLLER, "runs/mine"), ("miner", CONTROLLER, "runs/mine"), ("runs/mien", CONTROLLER, "runs/mine"),
+        ("mine", TASK, "runs/mine"), ("pids", CONTROLLER, "pid"), ("p", CONTROLLER, "p.onnx"),
+        ("p.onx", CONTROLLER, "p.onnx"), ("whloe.toml", TASK, "whole.toml"), ("whole", TASK, "whole.toml"),
+        ("whole", VEHICLE, ""), ("parts.toml", VEHICLE, "part.toml"), ("parts.toml", TASK, ""),
+        ("lgo.csv", FLIGHTS, "log.csv"),
+        ("mine", FLIGHTS, ""), (".", TASK, ""), ("quux", CONTROLLER, ""), ("nowhere/mine", CONTROLLER, ""),
+        ("n" * 5000, CONTROLLER, ""),
     ],
 )  # fmt: skip
-def test_an_unknown_name_gets_the_nearest_name_file_or_run(here, typed, hint):
-    assert meant(typed, CLASSICAL, [".onnx"]) == (f" Did you mean {hint}?" if hint else "")
+def test_an_unknown_name_gets_the_nearest_name_file_or_run_of_its_kind(here, typed, wanted, hint):
+    suffixes = {CONTROLLER: [".onnx"], FLIGHTS: [".csv"]}.get(wanted, [".toml"])
+    names = CLASSICAL if wanted == CONTROLLER else []
+    assert meant(typed, wanted, names, suffixes) == (f" Did you mean {hint}?" if hint else "")
 
 
 def test_a_folder_says_which_runs_it_holds(here):

@@ -53,27 +53,36 @@ def misplaced(name: str, wanted: str) -> str | None:
     use = USES[kind].format(shlex.quote(name))
     if wanted == CONTROLLER and kind == TASK:
         use = _policies_for(name) + use
+    if wanted == TASK and told == "a policy file":
+        use += f" Go on from it: flytune train baseline --from {shlex.quote(name)}."
     return f"{name} is {told}, not {wanted}. {use}"
 
 
-def meant(name: str, names: Iterable[str], suffixes: Iterable[str]) -> str:
-    """A hint at what an unknown name may have been meant for, after a space; or nothing.
+def meant(name: str, wanted: str, names: Iterable[str], suffixes: Iterable[str]) -> str:
+    """A hint at what an unknown name or missing file may have been meant for, after a space; or nothing.
 
     Args:
         name: that is neither among the names nor a path.
+        wanted: see `misplaced`.
         names: that would do.
         suffixes: of files that would do, beside run directories.
     """
-    path = Path(name)
-    paths = [Path("runs") / path, *(Path(f"{name}{suffix}") for suffix in suffixes)]
-    found = next((str(each) for each in paths if os.path.exists(each)), None) or nearest(name, names)
-    if found is None:
-        for folder in (path.parent, *([Path("runs")] if path.name == name else [])):
-            there = [each for each in _entries(folder) if is_run(folder / each) or Path(each).suffix in suffixes]
-            if near := nearest(path.name, there):
-                found = str(folder / near)
-                break
-    return f" Did you mean {found}?" if found else ""
+    path, suffixes = Path(name), tuple(suffixes)
+
+    def would_do(place: Path) -> bool:
+        if is_run(place):
+            return wanted in (TASK, CONTROLLER)
+        return place.suffix in suffixes and os.path.exists(place) and misplaced(str(place), wanted) is None
+
+    same = [Path("runs") / path, *(Path(f"{name}{suffix}") for suffix in suffixes)]
+    if found := next((str(each) for each in same if would_do(each)), None) or nearest(name, names):
+        return f" Did you mean {found}?"
+    for folder in (path.parent, *([Path("runs")] if path.name == name else [])):
+        # by their stems, since all files of a kind are alike in their suffix
+        there = {Path(each).stem: each for each in _entries(folder) if would_do(folder / each)}
+        if near := nearest(path.stem, there):
+            return f" Did you mean {folder / there[near]}?"
+    return ""
 
 
 def runs_in(folder: str | Path) -> str:

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from flytune.config.recognise import FLIGHTS, misplaced
+from flytune.config.recognise import FLIGHTS, meant, misplaced
 from flytune.errors import BadInput
 from flytune.evaluation.flights import Flights
 from flytune.evaluation.log_columns import TIMES, Column, check_columns, choose_columns, units_of
@@ -86,7 +86,8 @@ def _is_zip(path: Path) -> bool:
         with path.open("rb") as file:
             return file.read(4) == b"PK\x03\x04"
     except OSError as error:
-        raise BadInput(f"{path}: cannot be read ({error.strerror}). Give a .csv log or an .npz file.") from None
+        hint = meant(str(path), FLIGHTS, [], [".csv", ".npz"])
+        raise BadInput(f"{path}: cannot be read ({error.strerror}). Give a .csv log or an .npz file.{hint}") from None
 
 
 def _from_npz(

@@ -153,6 +153,8 @@ def find_controller(name: str, task: str | Task | None = None) -> FoundControlle
         return _from_run(name, path, wanted)
     if line := misplaced(name, CONTROLLER):
         raise BadInput(line)
+    if path.suffix in READERS and not os.path.exists(name) and (hint := meant(name, CONTROLLER, [], READERS)):
+        raise BadInput(f"{name}: no such file.{hint}")
     if path.suffix in READERS or os.path.isfile(name):
         return _from_file(name, path, wanted)
     kind, at, gains = name.partition("@")
@@ -163,7 +165,7 @@ def find_controller(name: str, task: str | Task | None = None) -> FoundControlle
         return FoundController(name=name, controller=controller, task=wanted, about=about)
     if name in shipped_names():
         return _shipped(name, wanted)
-    hint = meant(name, [*CLASSICAL, *shipped_names()], READERS)
+    hint = meant(name, CONTROLLER, [*CLASSICAL, *shipped_names()], READERS)
     raise BadInput(
         f"{name}: no such controller. Allowed: {KINDS}{''.join(f', {each}' for each in shipped_names())}.{hint}"
     )

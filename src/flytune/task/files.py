@@ -60,11 +60,13 @@ def load_task(task: str | Path, edits: dict[str, Any] | None = None) -> Task:
         raise BadInput(f"task: {line}")
     if name in preset_names():
         data, where = _preset(name), ""
+    elif name.endswith(".toml") and not os.path.exists(name) and (hint := meant(name, TASK, [], [".toml"])):
+        raise BadInput(f"task: {name}: no such file.{hint}")
     elif name.endswith(".toml") or os.path.isfile(name):
         data, given = _from_file(Path(name))
         where = name
     else:
-        hint = meant(name, preset_names(), [".toml"]) or runs_in(name)
+        hint = meant(name, TASK, preset_names(), [".toml"]) or runs_in(name)
         raise BadInput(
             f"task: {name!r} is no preset. Allowed: {', '.join(preset_names())}, a .toml file, or a run directory."
             f"{hint}"
@@ -159,6 +161,13 @@ def _vehicle(name: str, folder: Path = Path(), where: str = "") -> dict[str, Any
     """The tables of a vehicle, see `vehicle_table`; what is something else is refused with its use."""
     if name not in vehicle_names() and (line := misplaced(str(folder / Path(name).expanduser()), VEHICLE)):
         raise BadInput(f"{where}vehicle: {line}")
+    if (
+        name.endswith(".toml")
+        and not where
+        and not os.path.exists(name)
+        and (hint := meant(name, VEHICLE, [], [".toml"]))
+    ):
+        raise BadInput(f"vehicle: {name}: no such file.{hint}")
     return vehicle_table(name, folder, where)
 
 
