@@ -25,6 +25,7 @@ from flytune.simulation.simulator import WIDTHS, Simulator, VehicleStates, state
 from flytune.simulation.simulators import make_simulator
 from flytune.task.initial_state import EVALUATION_INITIAL_STATES, InitialState
 from flytune.task.observation import SIZE, draw_noise
+from flytune.task.target import sampled
 from flytune.task.task import Task
 
 ACTION = slice(SIZE - 4, SIZE)  # of an observation: the last action, which carries no noise
@@ -87,14 +88,16 @@ def fly(
     states, actions = np.asarray(record.states), np.asarray(record.actions)
     along = settings_along(controller, family, steps + 1) if isinstance(controller, ScheduledPolicy) else {}
     trajectories = VehicleStates.from_rows(np.ascontiguousarray(states.transpose(2, 0, 1)))
+    time = np.arange(steps + 1) * CONTROL_PERIOD
+    place, yaw = sampled(task.target, time)
     return Flights(
-        time=np.arange(steps + 1) * CONTROL_PERIOD,
+        time=time,
         **{field: getattr(trajectories, field) for field in WIDTHS},
         action=np.ascontiguousarray(actions.transpose(2, 0, 1)),
         crashed=np.asarray(record.crashed),
         margins=recorded_margins(family if along else task, along, states, actions),
-        target_position=np.asarray(task.target.position),
-        target_yaw=float(task.target.yaw),
+        target_position=place,
+        target_yaw=yaw,
         speed_bound=largest_speed_bound(family, along) if along else task.speed_bound,
         name=name,
         task=task.name,
@@ -247,7 +250,7 @@ def _episodes(task: Task, starts: jax.Array) -> jax.Array:
 def _started(task: Task, starts: jax.Array) -> Episode:
     def one(numbers: jax.Array) -> Episode:
         state = state_from(numbers, jnp.zeros((task.vehicle.action_latency_steps, 4)))
-        crashed = is_crashed(task, state)
+        crashed = is_crashed(task, state, 0)
         episode = begin(state)
         return dataclasses.replace(episode, steps=jnp.where(crashed, -1, episode.steps))
 

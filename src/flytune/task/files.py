@@ -4,7 +4,7 @@ import dataclasses
 import os
 from importlib import resources
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeGuard
 
 from flytune.config import document, nested
 from flytune.config.fields import annotations
@@ -13,7 +13,9 @@ from flytune.errors import BadInput
 from flytune.physics.plausibility import summary
 from flytune.physics.vehicle import Vehicle, vehicle_table
 from flytune.task.following import check_given, settings_to_check
+from flytune.task.target import of_kind
 from flytune.task.task import Task
+from flytune.task.waypoints import read_target
 
 TASK_FILE = "task.toml"  # in a run directory
 
@@ -102,6 +104,8 @@ def _from_file(path: Path, above: tuple[Path, ...] = ()) -> tuple[dict[str, Any]
     named = isinstance(vehicle := data.get("vehicle"), str)
     if isinstance(vehicle, str):
         data["vehicle"] = vehicle_table(vehicle, path.parent, f"{path}: ")
+    if _is_csv(target := data.get("target")):
+        data["target"] = read_target(target, path.parent, f"{path}: ")
     if "based_on" not in data:
         return data, given
     base = data["based_on"]
@@ -220,9 +224,15 @@ def _read(data: dict[str, Any], where: str = "") -> Task:
     for old, new in RENAMED.items():
         if nested.look_up(data, old) is not None:
             raise BadInput(f"{f'{where}: ' if where else ''}{old}: is called {new} now. Write {new} instead.")
+    if _is_csv(target := data.get("target")):
+        data = {**data, "target": read_target(target, Path(), f"{where}: " if where else "")}
     vehicle = data.get("vehicle")
     complete = {**data, "vehicle": vehicle_table(vehicle)} if isinstance(vehicle, str) else data
     return _at_default(document.read(Task, _without_removed(complete), where), where)
+
+
+def _is_csv(target: Any) -> TypeGuard[dict[str, Any]]:
+    return isinstance(target, dict) and target.get("kind") == "csv"
 
 
 def _without_removed(data: dict[str, Any]) -> dict[str, Any]:
@@ -258,6 +268,8 @@ def _edited(data: dict[str, Any], path: str, value: Any) -> dict[str, Any]:
     table, _, name = path.partition(".")
     if value == NONE and table in NAMED and name and "." not in name:
         _check_there(data, (table, name))
+    if path == "target.kind" and isinstance(value, str) and isinstance(data["target"], dict):
+        data = {**data, "target": of_kind(data["target"], value)}
     data = nested.edit(data, path, value)
     owner, field = (data["vehicle"], path[len("vehicle.") :]) if path.startswith("vehicle.") else (data, path)
     if not path.startswith(("name", "sources", "vehicle.name", "vehicle.sources")):

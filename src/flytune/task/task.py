@@ -14,13 +14,15 @@ from flytune.config.document import Real, Whole
 from flytune.config.formula import Formula
 from flytune.config.pytree import label, pytree, with_field
 from flytune.errors import BadInput
+from flytune.physics.dynamics import CONTROL_PERIOD
 from flytune.physics.vehicle import Vehicle
 from flytune.task.dial import Dial, Input, Setting, checked_setting, number_of_inputs, told
 from flytune.task.following import problem_of_dials, tables_at, words
 from flytune.task.initial_state import InitialState
 from flytune.task.observation import SIZE, ObservationNoise
 from flytune.task.reward import RewardTerm
-from flytune.task.situation import Target
+from flytune.task.reference import Reference
+from flytune.task.target import Point, Target
 from flytune.task.termination import Termination
 from flytune.task.training_settings import ApgSettings, PpoSettings
 
@@ -68,6 +70,12 @@ class Task:
     def inputs(self) -> int:
         """How many numbers a controller of this task is given: 17, and those of its dials."""
         return SIZE + number_of_inputs(self.input)
+
+    def reference(self, steps: Any) -> Reference:
+        """Where the target is after some control steps, and how it moves; a fixed one is the same at any time."""
+        if isinstance(self.target, Point):
+            return self.target.reference()
+        return self.target.reference(jnp.maximum(steps, 0) * CONTROL_PERIOD, self.vehicle.gravity)
 
     def draw(self, key: jax.Array) -> tuple[Any, jax.Array]:
         """The settings of the dials of one episode; without a dial nothing, and the key itself. See `TaskFamily`."""
