@@ -28,7 +28,9 @@ def derived() -> Any:
     return dataclasses.field(default=None, compare=False, repr=False, metadata={"derived": True})
 
 
-@dataclass_transform(frozen_default=True, kw_only_default=True, field_specifiers=(dataclasses.field, static, label, derived))
+@dataclass_transform(
+    frozen_default=True, kw_only_default=True, field_specifiers=(dataclasses.field, static, label, derived)
+)
 def pytree(cls: type[T]) -> type[T]:
     """The class as a frozen, keyword-only dataclass, registered as a JAX pytree.
 

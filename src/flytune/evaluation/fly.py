@@ -78,6 +78,8 @@ def fly(
     initial_state = initial_conditions if own else EVALUATION_INITIAL_STATES[initial_conditions]
     if problem := initial_state.problem() or initial_state.problem_around(task.target):
         raise BadInput(f"starts {starts_name}: {problem}")
+    if problem := task.problem_of_path(duration):
+        raise BadInput(problem)
     task = dataclasses.replace(task, initial_state=initial_state)
     starts, noise_keys = _begin(task, trial_keys(seed, trials))
     simulator_name, made = _made(simulator, task.vehicle, trials, simulator_options)

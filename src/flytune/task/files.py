@@ -147,6 +147,10 @@ def _laid_over(
             below = {**below, name: {}}
     if isinstance(vehicle := changes.get("vehicle"), dict) and "vehicle" in below and not whole_vehicle:
         changes["vehicle"] = _vehicle_over(below["vehicle"], vehicle)
+    if "kind" in _table(changes, "target") and changes["target"]["kind"] != _table(below, "target").get(
+        "kind", "point"
+    ):
+        below = {**below, "sources": _without_target(below.get("sources", {}))}
     if "vehicle" in changes:  # which is laid over already
         below = {key: value for key, value in below.items() if key != "vehicle"}
     return nested.overlay(below, changes)
@@ -224,11 +228,25 @@ def _read(data: dict[str, Any], where: str = "") -> Task:
     for old, new in RENAMED.items():
         if nested.look_up(data, old) is not None:
             raise BadInput(f"{f'{where}: ' if where else ''}{old}: is called {new} now. Write {new} instead.")
-    if _is_csv(target := data.get("target")):
+    target = _table(data, "target")
+    if "position" in target and target.get("kind") in ("circle", "lemniscate", "helix"):
+        raise BadInput(
+            f"{f'{where}: ' if where else ''}target.position: a {target['kind']} has a centre. Write target.centre."
+        )
+    if _is_csv(target):
         data = {**data, "target": read_target(target, Path(), f"{where}: " if where else "")}
     vehicle = data.get("vehicle")
     complete = {**data, "vehicle": vehicle_table(vehicle)} if isinstance(vehicle, str) else data
     return _at_default(document.read(Task, _without_removed(complete), where), where)
+
+
+def _table(data: dict[str, Any], name: str) -> dict[str, Any]:
+    return data[name] if isinstance(data.get(name), dict) else {}
+
+
+def _without_target(sources: dict[str, str]) -> dict[str, str]:
+    """The sources without those of the target, which has another kind now."""
+    return {path: text for path, text in sources.items() if path.split(".")[0] != "target"}
 
 
 def _is_csv(target: Any) -> TypeGuard[dict[str, Any]]:
@@ -269,7 +287,8 @@ def _edited(data: dict[str, Any], path: str, value: Any) -> dict[str, Any]:
     if value == NONE and table in NAMED and name and "." not in name:
         _check_there(data, (table, name))
     if path == "target.kind" and isinstance(value, str) and isinstance(data["target"], dict):
-        data = {**data, "target": of_kind(data["target"], value)}
+        sources = _without_target(data.get("sources", {}))
+        data = {**data, "target": of_kind(data["target"], value), "sources": sources}
     data = nested.edit(data, path, value)
     owner, field = (data["vehicle"], path[len("vehicle.") :]) if path.startswith("vehicle.") else (data, path)
     if not path.startswith(("name", "sources", "vehicle.name", "vehicle.sources")):

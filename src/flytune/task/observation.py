@@ -75,7 +75,9 @@ def observe(
     numbers = unpack(normal)
     position = add(in_heading_frame(target, position_error(target, state.position)), scale(noise.position, numbers[:3]))
     attitude = rotation.normalise(add(attitude_error(target, state.attitude), scale(noise.attitude, numbers[3:7])))
-    velocity = add(in_heading_frame(target, velocity_error(target, state.velocity)), scale(noise.velocity, numbers[7:10]))
+    velocity = add(
+        in_heading_frame(target, velocity_error(target, state.velocity)), scale(noise.velocity, numbers[7:10])
+    )
     turning = body_rate_error(target, state.attitude, state.body_rate)
     body_rate = add(turning, scale(noise.body_rate, numbers[10:]))
     return pack((*position, *attitude, *velocity, *body_rate, *unpack(last_action)))

@@ -21,6 +21,7 @@ from flytune.task.following import problem_of_dials, tables_at, words
 from flytune.task.initial_state import InitialState
 from flytune.task.observation import SIZE, ObservationNoise
 from flytune.task.reward import RewardTerm
+from flytune.task.path_check import problem_of_path
 from flytune.task.reference import Reference
 from flytune.task.target import Point, Target
 from flytune.task.termination import Termination
@@ -133,7 +134,13 @@ class Task:
             return "reward: no term. Allowed: one or more tables [reward.NAME]."
         if not re.fullmatch(r"[\w .+-]{1,100}", self.name):
             return f"name: {self.name[:100]!r} cannot name a run. Allowed: up to 100 letters, digits and . _ + - signs."
-        return problem_of_dials(self.dial, self.follow, self.input)
+        flown = max(float(self.duration), float(self.horizon) * CONTROL_PERIOD)
+        return problem_of_dials(self.dial, self.follow, self.input) or self.problem_of_path(flown)
+
+    def problem_of_path(self, duration: float) -> str | None:
+        """What of the target's path cannot be flown for a duration in s within the bounds, or None."""
+        vehicle = self.vehicle
+        return problem_of_path(self.target, self.termination, vehicle.gravity, vehicle.thrust_to_weight, duration)
 
 
 @runtime_checkable

@@ -41,7 +41,9 @@ class Waypoints(Path):
     times: tuple[Annotated[Real, Ge(0), Le(3600), Unit("s")], ...] = label(default=())  # the first is 0
     positions: tuple[tuple[Metres, Metres, Metres], ...] = label(default=())  # one for each time
     yaws: tuple[Annotated[Real, Ge(-1000), Le(1000), Unit("rad")], ...] = label(default=())  # none: always `yaw`
-    yaw: Annotated[Real, Ge(-2 * math.pi), Le(2 * math.pi), Unit("rad")] = label(default=0.0)  # with yaws: added to them
+    yaw: Annotated[Real, Ge(-2 * math.pi), Le(2 * math.pi), Unit("rad")] = label(
+        default=0.0
+    )  # with yaws: added to them
     interpolation: Literal["steps", "smooth"] = static(default="steps")
     ends: Literal["at_rest", "free"] = label(default="at_rest")  # of a smooth curve: where it begins and ends
     table: Derived = derived()  # [waypoints, 17]: time, and the cubic polynomial of x, y, z, yaw from there on
@@ -139,10 +141,16 @@ def read_target(target: Mapping[str, Any], folder: File, where: str = "") -> dic
         if key not in known:
             raise BadInput(f"{where}target.{key}: no such field of a csv. Fields here: {', '.join(known)}.")
     if not isinstance(target.get("file"), str):
-        raise BadInput(f'{where}target.file: missing. Allowed: a file with the columns {", ".join(COLUMNS)}.')
+        raise BadInput(f"{where}target.file: missing. Allowed: a file with the columns {', '.join(COLUMNS)}.")
     file = folder / File(target["file"]).expanduser()
     kept = {key: value for key, value in target.items() if key not in ("kind", "file")}
-    return {"kind": "waypoints", "interpolation": "smooth", "ends": "free", **kept, **_read(file, f"{where}target.file: {file}")}
+    return {
+        "kind": "waypoints",
+        "interpolation": "smooth",
+        "ends": "free",
+        **kept,
+        **_read(file, f"{where}target.file: {file}"),
+    }
 
 
 def _read(file: File, where: str) -> dict[str, Any]:
@@ -157,7 +165,9 @@ def _read(file: File, where: str) -> dict[str, Any]:
     names = [name.strip().lower() for name in rows[0]] if rows else []
     lacking = [name for name in COLUMNS[:4] if name not in names]
     if lacking:
-        raise BadInput(f"{where}: has no column {', '.join(lacking)}. Its first row has to name t, x, y, z and, where wanted, yaw.")
+        raise BadInput(
+            f"{where}: has no column {', '.join(lacking)}. Its first row has to name t, x, y, z and, where wanted, yaw."
+        )
     columns = {name: names.index(name) for name in COLUMNS if name in names}
     if not 2 <= len(rows) - 1 <= MOST:
         raise BadInput(f"{where}: has {len(rows) - 1} rows of numbers. Allowed: 2 to {MOST}.")
@@ -166,12 +176,14 @@ def _read(file: File, where: str) -> dict[str, Any]:
     time, steps = numbers[:, 0], np.diff(numbers[:, 0])
     if (steps <= 0).any():
         line = int(np.argmax(steps <= 0))
-        raise BadInput(f"{where}: row {line + 3}: t goes from {time[line]:g} to {time[line + 1]:g} s. Allowed: rising times.")
+        raise BadInput(
+            f"{where}: row {line + 3}: t goes from {time[line]:g} to {time[line + 1]:g} s. Allowed: rising times."
+        )
     if (steps > LARGEST_GAP * np.median(steps)).any():
         line = int(np.argmax(steps))
         raise BadInput(
             f"{where}: row {line + 3}: no sample for {steps[line]:.3g} s, where rows are {np.median(steps):.3g} s apart. "
-            f"Allowed: up to {LARGEST_GAP} times that. Fill the gap, or write kind = \"waypoints\" with times and positions."
+            f'Allowed: up to {LARGEST_GAP} times that. Fill the gap, or write kind = "waypoints" with times and positions.'
         )
     found = {"times": (time - time[0]).round(9).tolist(), "positions": numbers[:, 1:4].tolist()}
     return found | ({"yaws": np.unwrap(numbers[:, 4]).tolist()} if "yaw" in columns else {})
