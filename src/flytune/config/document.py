@@ -34,8 +34,8 @@ from flytune.config.writing import plain, source_of, write
 from flytune.errors import BadInput
 
 __all__ = [
-    "Derived", "Real", "Vector", "Whole", "allowed", "load", "nearest", "parse", "parse_assignment", "plain", "read", "source_of",
-    "unit_of", "write",
+    "Derived", "Real", "Vector", "Whole", "allowed", "load", "nearest", "parse", "parse_assignment", "plain", "read",
+    "source_of", "unit_of", "write",
 ]  # fmt: skip
 
 T = TypeVar("T")

@@ -141,7 +141,7 @@ class StepJudgement:
     """The response to one step of a target that steps, on its own: times count from the step."""
 
     begin: float  # s from the start of the trial
-    target: tuple[float, float, float, float]  # x, y, z in m and yaw in rad
+    target: tuple[float, ...]  # x, y, z in m and yaw in rad
     judgement: Judgement
 
     def to_dict(self) -> dict:
@@ -210,7 +210,7 @@ def _judge_steps(parts: Sequence[Flights]) -> tuple[StepJudgement, ...]:
     return tuple(
         StepJudgement(
             begin=round(float(begin), 6),
-            target=(*map(float, part.target_position), part.target_yaw),
+            target=(*part.target_position.tolist(), part.target_yaw),
             judgement=judge(part),
         )
         for begin, part in zip(begins, parts, strict=True)

@@ -4,9 +4,10 @@ All of it is written from `Judgement.to_dict`, with '-' where a quantile is infi
 """
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
+from flytune.evaluation.path_table import path_tables
 from flytune.tables import Column, Table, number
 
 AXES = ("x", "y", "z", "yaw")
@@ -23,31 +24,6 @@ COLUMNS = (
     Column("median", lambda row: row["error"]["median"], group="   steady-state error", width=9),
     Column("p95", lambda row: row["error"]["p95"], group="   steady-state error", width=10),
     Column("", lambda row: row["unit"], align="left", width=0),
-)  # fmt: skip
-
-TRACKING = (
-    Column("tracking", lambda judged: judged["who"], align="left", width=10),
-    *(Column(title, lambda judged, key=key: judged["tracking"][key]["median"], group="error [mm]", decimals=1,
-             scale=1e3, width=9)
-      for title, key in (("mean", "mean_error"), ("p95", "p95_error"), ("max", "maximum_error"),
-                         ("along", "along_error"), ("across", "across_error"))),
-    Column("[s]", lambda judged: _without_sign_of_zero(judged["tracking"]["lag"]["median"]), group="lag", decimals=3, width=9),
-    Column("after [s]", lambda judged: judged["tracking"]["begin"], decimals=1, width=11),
-)  # fmt: skip
-
-STEPS = (
-    Column("step at [s]", lambda step: f"{step['begin']:g}", width=11),
-    Column("  to", lambda step: _target_text(step), align="left", width=26),
-    Column("", lambda step: f"{step['position']['settled']}/{step['trials']}", group="settled", width=9),
-    Column("median", lambda step: step["position"]["settling_time"]["median"], group="settling time [s]", decimals=2,
-           width=11),
-    Column("p95", lambda step: step["position"]["settling_time"]["p95"], group="settling time [s]", decimals=2, width=9),
-    Column("median", lambda step: step["position"]["overshoot"]["median"], group="overshoot [%]", decimals=1,
-           scale=100.0, width=10),
-    Column("p95", lambda step: step["position"]["overshoot"]["p95"], group="overshoot [%]", decimals=1, scale=100.0,
-           width=6),
-    Column("[mm]", lambda step: step["position"]["steady_state_error"]["median"], group="error", decimals=1, scale=1e3,
-           width=9),
 )  # fmt: skip
 
 
@@ -92,27 +68,6 @@ def response_text(judged: Mapping[str, Any]) -> str:
     ]
     tables = [response_table(judged), *path_tables([judged])]
     return "\n".join([heading, "", *(f"{table.text()}\n" for table in tables), *footer])
-
-
-def path_tables(several: Sequence[Mapping[str, Any]]) -> list[Table]:
-    """Of targets that move, the table of tracking, a row per judgement; of those that step, a table of their steps."""
-    tables = []
-    if tracked := [judged for judged in several if judged.get("tracking")]:
-        tables.append(Table.of(TRACKING, tracked))
-    for judged in several:
-        if judged.get("steps"):
-            tables.append(Table.of(STEPS, [{**step, "trials": judged["trials"]} for step in judged["steps"]]))
-    return tables
-
-
-def _without_sign_of_zero(value: float | None) -> float | None:
-    return None if value is None else round(value, 3) + 0.0
-
-
-def _target_text(step: Mapping[str, Any]) -> str:
-    *place, yaw = step["target"]
-    turned = f", {math.degrees(yaw):.4g} deg" if yaw else ""
-    return f"  {', '.join(f'{value:g}' for value in place)} m{turned}"
 
 
 def _shown(setting: Any) -> str:

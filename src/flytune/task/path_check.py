@@ -46,13 +46,13 @@ def problem_of_path(
     if isinstance(target, Waypoints) and target.interpolation == "steps":
         return None
     velocity = _rate(place)
-    thrust = _rate(velocity) + [0.0, 0.0, gravity]
+    thrust = _rate(velocity) + np.array([0.0, 0.0, gravity])
     size = np.linalg.norm(thrust, axis=-1, keepdims=True)
     upwards = thrust / size
     asked = {
         "speed": np.linalg.norm(velocity, axis=-1),
         "tilt": np.arccos(np.clip(upwards[:, 2], -1, 1)),
-        "body_rate": np.hypot(np.linalg.norm(_rate(upwards), axis=-1), _rate(yaw)),
+        "body_rate": np.hypot(np.linalg.norm(_rate(upwards), axis=-1), _rate(np.unwrap(yaw))),
     }
     for name, bound in termination.items():
         if bound.quantity not in asked:

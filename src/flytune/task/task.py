@@ -20,9 +20,9 @@ from flytune.task.dial import Dial, Input, Setting, checked_setting, number_of_i
 from flytune.task.following import problem_of_dials, tables_at, words
 from flytune.task.initial_state import InitialState
 from flytune.task.observation import SIZE, ObservationNoise
-from flytune.task.reward import RewardTerm
 from flytune.task.path_check import problem_of_path
 from flytune.task.reference import Reference
+from flytune.task.reward import RewardTerm
 from flytune.task.target import Point, Target
 from flytune.task.termination import Termination
 from flytune.task.training_settings import ApgSettings, PpoSettings

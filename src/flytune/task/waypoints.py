@@ -87,7 +87,8 @@ class Waypoints(Path):
             return f"times: {self.times[0]:g} s is not allowed as the first time. Allowed: 0."
         if (gaps <= 0).any():
             where = int(np.argmax(gaps <= 0))
-            return f"times: {self.times[where + 1]:g} s does not come after {self.times[where]:g} s. Allowed: rising times."
+            before, after = self.times[where : where + 2]
+            return f"times: {after:g} s does not come after {before:g} s. Allowed: rising times."
         for name in ("positions", "yaws"):
             given = len(getattr(self, name))
             if given != number and (given or name == "positions"):
@@ -182,8 +183,9 @@ def _read(file: File, where: str) -> dict[str, Any]:
     if (steps > LARGEST_GAP * np.median(steps)).any():
         line = int(np.argmax(steps))
         raise BadInput(
-            f"{where}: row {line + 3}: no sample for {steps[line]:.3g} s, where rows are {np.median(steps):.3g} s apart. "
-            f'Allowed: up to {LARGEST_GAP} times that. Fill the gap, or write kind = "waypoints" with times and positions.'
+            f"{where}: row {line + 3}: no sample for {steps[line]:.3g} s, where rows are {np.median(steps):.3g} s "
+            f"apart. Allowed: up to {LARGEST_GAP} times that. Fill the gap, or write kind = "
+            '"waypoints" with times and positions.'
         )
     found = {"times": (time - time[0]).round(9).tolist(), "positions": numbers[:, 1:4].tolist()}
     return found | ({"yaws": np.unwrap(numbers[:, 4]).tolist()} if "yaw" in columns else {})
