@@ -14,12 +14,12 @@ from scipy.interpolate import CubicSpline
 from flytune.config.document import Derived, Real
 from flytune.config.pytree import derived, label, pytree, static
 from flytune.errors import BadInput
+from flytune.kernels.batched import LARGEST
 from flytune.physics.components import Components
 from flytune.task.paths import Metres
 from flytune.task.reference import Path, Reference
 
 MOST = 10_000  # waypoints; a task and a policy's file hold them all
-FEW = 16  # of so many, compiled code compares with all; of more, it looks one up
 SHORTEST_STEP = 0.5  # s; nothing settles sooner, since it has to stay in the band for so long
 LARGEST_GAP = 10  # in a file, times the median time from row to row
 COLUMNS = ("t", "x", "y", "z", "yaw")
@@ -116,9 +116,9 @@ class Waypoints(Path):
         rows = self.table
         if xp is np:
             row = rows[np.searchsorted(rows[:, 0], time, side="right") - 1].T
-        elif len(rows) > FEW:
+        elif rows.size > LARGEST:
             row = rows[jnp.sum(rows[:, 0] <= time) - 1]
-        else:  # a look-up has no form as a kernel
+        else:  # a kernel compares with all of them
             here = jnp.arange(len(rows)) == jnp.sum(jnp.where(rows[:, 0] <= time, 1, 0)) - 1
             row = jnp.sum(jnp.where(here[:, None], rows, 0.0), axis=0)
         elapsed = time - row[0]
