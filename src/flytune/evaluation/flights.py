@@ -81,6 +81,11 @@ class Flights(Labels):
         return self.target_position.ndim == 2
 
     @property
+    def start_error(self) -> np.ndarray:
+        """The way from the target to each start, [N, 3] in m, where the target is at the start."""
+        return self.position[:, 0] - (self.target_position[0] if self.moving else self.target_position)
+
+    @property
     def steps(self) -> list["Flights"]:
         """The flights to each place of a target that steps, each from time 0 on; none of one that moves otherwise.
 

@@ -172,8 +172,7 @@ def judge(flights: Flights) -> Judgement:
     responses = {name: channel.response(time, crashed) for name, channel in _channels(flights, time, crashed).items()}
     action, velocity = _double(flights.action), _double(flights.velocity)
     unknown = np.full(flights.trials, np.nan)  # of what the log of a flight lacks
-    begin = flights.target_position[0] if flights.moving else flights.target_position
-    start = np.asarray(flights.position[:, 0], dtype=np.float64) - begin
+    start = np.asarray(flights.start_error, dtype=np.float64)
     bound = (
         np.zeros(flights.trials)
         if flights.moving

@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float
 from flytune.evaluation.flights import Flights
 from flytune.evaluation.statistics import summary
 
-LARGEST_LAG = 1.0  # s; a larger one is not told from another lap
+LARGEST_LAG = 1.0  # s; a vehicle farther behind or ahead does not follow
 STILL = 1e-3  # m/s; a slower target has no direction, and shows no lag
 ERRORS = ("median", "p75", "p95", "max")
 LAGS = ("median", "p25", "p75", "p95")
@@ -30,7 +30,7 @@ class Tracking:
     maximum_error: PerTrial  # m
     along_error: PerTrial  # m, mean of the size along the direction of the target's motion
     across_error: PerTrial  # m, mean distance from the line through the target in this direction
-    lag: PerTrial  # s, positive behind; NaN where the target does not move
+    lag: PerTrial  # s, positive behind; +inf where it is beyond LARGEST_LAG; NaN where the target does not move
 
     def to_dict(self) -> dict[str, Any]:
         """Plain Python values; quantiles over the trials, None where infinite."""
@@ -99,9 +99,11 @@ def _lag(
     shifts = np.arange(-most, most + 1)
     seen = position[:, samples]
     left = np.stack([np.square(seen - target[samples - shift]).sum(axis=-1).mean(axis=1) for shift in shifts], axis=1)
-    best = np.clip(left.argmin(axis=1), 1, shifts.size - 2)
+    best = left.argmin(axis=1)
+    inside = (best > 0) & (best < shifts.size - 1)
+    best = np.clip(best, 1, shifts.size - 2)
     rows = np.arange(len(left))
     before, here, after = (left[rows, best + step] for step in (-1, 0, 1))
     bend = before - 2 * here + after
     part = np.divide(before - after, 2 * bend, out=np.zeros_like(bend), where=bend > 0)
-    return (shifts[best] + np.clip(part, -1.0, 1.0)) * period
+    return np.where(inside, (shifts[best] + part) * period, np.inf)

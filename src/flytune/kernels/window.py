@@ -17,6 +17,7 @@ from jaxtyping import Array, Float, UInt32
 
 from flytune.kernels.batched import Kernel, Prepared, has_table, words
 from flytune.kernels.dense import Actor, backward_function, forward_function, parameters_of
+from flytune.kernels.emit import Unsupported
 from flytune.kernels.native import loop, module, register
 from flytune.kernels.writer import Writer
 
