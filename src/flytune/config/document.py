@@ -14,6 +14,7 @@ from typing import Any, TypeVar, get_args, get_origin
 from pydantic import TypeAdapter, ValidationError
 
 from flytune.config.fields import (
+    Derived,
     Real,
     Vector,
     Whole,
@@ -36,8 +37,8 @@ from flytune.config.writing import plain, source_of, write
 from flytune.errors import BadInput
 
 __all__ = [
-    "Real", "Vector", "Whole", "allowed", "load", "nearest", "parse", "parse_assignment", "plain", "read", "source_of",
-    "unit_of", "write",
+    "Derived", "Real", "Vector", "Whole", "allowed", "load", "nearest", "parse", "parse_assignment", "plain", "read",
+    "source_of", "unit_of", "write",
 ]  # fmt: skip
 
 T = TypeVar("T")

@@ -22,6 +22,12 @@ def _single(value: float) -> float:
     return value
 
 
+def _computed(value: Any) -> Any:
+    """Refuse a value in a file for a field that is `derived`."""
+    raise ValueError("it is computed from the other fields, leave it out")
+
+
+Derived = Annotated[Any, BeforeValidator(_computed)]
 Real = Annotated[float, Strict(), AllowInfNan(False), AfterValidator(_single)]
 
 
@@ -200,8 +206,10 @@ def unwrap(annotation: Any) -> tuple[Any, list[Any]]:
 
 
 def annotations(kind: Any) -> dict[str, Any]:
-    """The annotation of each field of a dataclass, with `Annotated`."""
-    return get_type_hints(kind, include_extras=True)
+    """The annotation of each field of a dataclass that a file may hold, with `Annotated`."""
+    hints = get_type_hints(kind, include_extras=True)
+    fields = getattr(kind, "__dataclass_fields__", {})
+    return {name: hint for name, hint in hints.items() if not (name in fields and fields[name].metadata.get("derived"))}
 
 
 def step_into(annotation: Any, name: Any, data: Any) -> Any:

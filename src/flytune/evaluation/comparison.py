@@ -5,7 +5,7 @@ from collections.abc import Sequence
 
 from flytune.errors import BadInput
 from flytune.evaluation.comparison_table import MAY_DIFFER, comparison_text
-from flytune.evaluation.difference import METRICS, Difference, compare_metric
+from flytune.evaluation.difference import Difference, Metric, compare_metric, metrics_of
 from flytune.evaluation.judge import Judgement
 
 SHARED = {  # what has to be the same: how it is called, the option that sets it, and its unit
@@ -28,6 +28,11 @@ class Comparison:
 
     def __repr__(self) -> str:
         return f"Comparison({', '.join(self.names)}; with {self.names[self.reference]})"
+
+    @property
+    def metrics(self) -> tuple[Metric, ...]:
+        """What is compared: the tracking error too, where the target moves for all of them."""
+        return metrics_of(self.judgements)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -79,7 +84,9 @@ def compare(judgements: Sequence[Judgement], *, reference: int = 0) -> Compariso
                 )
     against = named[reference]
     others = [controller for controller in named if controller is not against]
-    differences = tuple(compare_metric(controller, against, metric) for controller in others for metric in METRICS)
+    differences = tuple(
+        compare_metric(controller, against, metric) for controller in others for metric in metrics_of(named)
+    )
     return Comparison(judgements=tuple(named), reference=reference, differences=differences)
 
 

@@ -6,8 +6,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from flytune.evaluation.difference import METRICS, Difference
+from flytune.evaluation.difference import Difference
 from flytune.evaluation.judge import CHANNELS, Judgement
+from flytune.evaluation.path_table import path_tables
 from flytune.tables import NULL, Cell, Column, Table
 
 if TYPE_CHECKING:
@@ -62,6 +63,8 @@ def _row(number: int, judgement: Judgement) -> dict:
 def comparison_text(comparison: "Comparison") -> str:
     """The comparison for a terminal: the table, and beneath it how each controller differs from the reference."""
     lines = [conditions(comparison), "", comparison_table(comparison.judgements).text()]
+    for table in path_tables([judgement.to_dict() for judgement in comparison.judgements]):
+        lines += ["", table.text()]
     for first, *others in sentences(comparison):
         lines += ["", first, *(f"    {text}" for text in others)]
     return "\n".join([*lines, "", *NOTE])
@@ -72,7 +75,7 @@ def differences_table(comparison: "Comparison") -> Table:
     names, reference = comparison.names, comparison.reference
     others = [f"{number} {name}" for number, name in enumerate(names, start=1) if number != reference + 1]
     rows = []
-    for metric in METRICS:
+    for metric in comparison.metrics:
         unit, scale = metric.shown
         found = (_difference_cell(one, scale) for one in comparison.differences if one.metric is metric)
         rows.append((f"{metric.title} [{unit}]", *found))

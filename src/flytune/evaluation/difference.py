@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+from collections.abc import Sequence
 
 import numpy as np
 from jaxtyping import Float
@@ -15,6 +16,7 @@ FIELDS = {  # of the judgement: in words, and how a controller with more of it c
     "overshoot": ("overshoot", "more", "less"),
     "steady_state_error": ("steady-state error", "farther off", "nearer"),
     "rms_error": ("RMS error", "larger", "smaller"),
+    "tracking_error": ("tracking error", "farther off", "nearer"),
     "peak_speed": ("peak speed", "faster", "slower"),
     "action_rms": ("action, RMS", "harder", "more gently"),
     "action_total_variation": ("action, change", "more", "less"),
@@ -71,6 +73,8 @@ class Metric:
 
         Speed and action stop at a crash, which makes them small: they are NaN for a crashed trial.
         """
+        if self.field == "tracking_error":
+            return judgement.tracking.mean_error if judgement.tracking else np.full(judgement.trials, np.nan)
         values = getattr(judgement, self.field)
         return values[self.channel] if self.channel else np.where(judgement.crashed, np.nan, values)
 
@@ -89,6 +93,14 @@ METRICS = (
     Metric("action_rms", None, "1", "acts (RMS)", "as hard as", decimals=4),
     Metric("action_total_variation", None, "1", "changes its action per step", "as much as", decimals=4),
 )
+
+
+TRACKING = Metric("tracking_error", None, "m", "tracks", "as closely as")
+
+
+def metrics_of(judgements: Sequence[Judgement]) -> tuple[Metric, ...]:
+    """The metrics in which controllers are compared; the mean tracking error where the target moves for all."""
+    return (*METRICS, TRACKING) if all(judgement.tracking for judgement in judgements) else METRICS
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

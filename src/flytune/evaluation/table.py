@@ -7,6 +7,7 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
+from flytune.evaluation.path_table import path_tables
 from flytune.tables import Column, Table, number
 
 AXES = ("x", "y", "z", "yaw")
@@ -67,7 +68,8 @@ def response_text(judged: Mapping[str, Any]) -> str:
     if any(small.values()):
         told = ", ".join(f"{axis} {count}" for axis, count in small.items())
         footer.append(f"steps too small for overshoot and rise: {told}")
-    return "\n".join([heading, "", response_table(judged).text(), "", *footer])
+    tables = [response_table(judged), *path_tables([judged])]
+    return "\n".join([heading, "", *(f"{table.text()}\n" for table in tables), *footer])
 
 
 def _shown(setting: Any) -> str:

@@ -4,7 +4,7 @@ import dataclasses
 import os
 from importlib import resources
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeGuard
 
 from flytune.config import document, nested
 from flytune.config.fields import annotations, is_named
@@ -14,7 +14,9 @@ from flytune.errors import BadInput
 from flytune.physics.plausibility import summary
 from flytune.physics.vehicle import Vehicle, vehicle_names, vehicle_table
 from flytune.task.following import check_given, settings_to_check
+from flytune.task.target import of_kind
 from flytune.task.task import Task
+from flytune.task.waypoints import read_target
 
 TASK_FILE = "task.toml"  # in a run directory
 
@@ -107,6 +109,8 @@ def _from_file(path: Path, above: tuple[Path, ...] = ()) -> tuple[dict[str, Any]
     named = isinstance(vehicle := data.get("vehicle"), str)
     if isinstance(vehicle, str):
         data["vehicle"] = _vehicle(vehicle, path.parent, f"{path}: ")
+    if _is_csv(target := data.get("target")):
+        data["target"] = read_target(target, path.parent, f"{path}: ")
     if "based_on" not in data:
         return data, given
     base = data["based_on"]
@@ -152,6 +156,10 @@ def _laid_over(
         _check_table(below, path, value, f"{where}: ")
     if isinstance(vehicle := changes.get("vehicle"), dict) and "vehicle" in below and not whole_vehicle:
         changes["vehicle"] = _vehicle_over(below["vehicle"], vehicle)
+    if "kind" in _table(changes, "target") and changes["target"]["kind"] != _table(below, "target").get(
+        "kind", "point"
+    ):
+        below = {**below, "sources": _without_target(below.get("sources", {}))}
     if "vehicle" in changes:  # which is laid over already
         below = {key: value for key, value in below.items() if key != "vehicle"}
     return nested.overlay(below, changes)
@@ -258,9 +266,29 @@ def _read(data: dict[str, Any], where: str = "") -> Task:
     for old, new in RENAMED.items():
         if nested.look_up(data, old) is not None:
             raise BadInput(f"{f'{where}: ' if where else ''}{old}: is called {new} now. Write {new} instead.")
+    target = _table(data, "target")
+    if "position" in target and target.get("kind") in ("circle", "lemniscate", "helix"):
+        raise BadInput(
+            f"{f'{where}: ' if where else ''}target.position: a {target['kind']} has a centre. Write target.centre."
+        )
+    if _is_csv(target):
+        data = {**data, "target": read_target(target, Path(), f"{where}: " if where else "")}
     vehicle = data.get("vehicle")
     complete = {**data, "vehicle": _vehicle(vehicle)} if isinstance(vehicle, str) else data
     return _at_default(document.read(Task, _without_removed(complete), where), where)
+
+
+def _table(data: dict[str, Any], name: str) -> dict[str, Any]:
+    return data[name] if isinstance(data.get(name), dict) else {}
+
+
+def _without_target(sources: dict[str, str]) -> dict[str, str]:
+    """The sources without those of the target, which has another kind now."""
+    return {path: text for path, text in sources.items() if path.split(".")[0] != "target"}
+
+
+def _is_csv(target: Any) -> TypeGuard[dict[str, Any]]:
+    return isinstance(target, dict) and target.get("kind") == "csv"
 
 
 def _without_removed(data: dict[str, Any]) -> dict[str, Any]:
@@ -297,6 +325,9 @@ def _edited(data: dict[str, Any], path: str, value: Any) -> dict[str, Any]:
     if value == NONE and table in NAMED and name and "." not in name:
         _check_there(data, (table, name))
     _check_table(data, path, value)
+    if path == "target.kind" and isinstance(value, str) and isinstance(data["target"], dict):
+        sources = _without_target(data.get("sources", {}))
+        data = {**data, "target": of_kind(data["target"], value), "sources": sources}
     data = nested.edit(data, path, value)
     owner, field = (data["vehicle"], path[len("vehicle.") :]) if path.startswith("vehicle.") else (data, path)
     if not path.startswith(("name", "sources", "vehicle.name", "vehicle.sources")):
