@@ -140,7 +140,7 @@ class Task:
     def problem_of_path(self, duration: float) -> str | None:
         """What of the target's path cannot be flown for a duration in s within the bounds, or None."""
         vehicle = self.vehicle
-        return problem_of_path(self.target, self.termination, vehicle.gravity, vehicle.thrust_to_weight, duration)
+        return problem_of_path(self.target, self.termination, vehicle.gravity, vehicle.full_thrust_to_weight, duration)
 
 
 @runtime_checkable
