@@ -157,7 +157,7 @@ def test_a_file_that_is_too_large_is_refused_before_it_is_read(tmp_path, capsys)
 ARRAYS = {"time": TIME, "position": np.stack([X, Y, Z], axis=-1), "yaw": YAW, "target_position": [0.0, 0.0, 1.0]}
 NPZ = {
     "no yaw": ({"yaw": None}, "has no array yaw. Found: time, position, target_position"),
-    "no target": ({"target_position": None}, "has no array target_position"),
+    "no target": ({"target_position": None}, "position, yaw. Give --target x,y,z,yaw in m and rad."),
     "words": ({"yaw": np.array(["a"] * 801)}, "yaw holds <U1, not numbers"),
     "objects": ({"yaw": np.array([{}] * 801)}, "is no file of flights (Object arrays cannot be loaded"),
     "another length": ({"yaw": YAW[:-1]}, "yaw: the shape (1, 800, 1) is not allowed with time (801,)"),
@@ -170,6 +170,13 @@ def test_arrays_that_cannot_be_used_are_refused_in_one_line(tmp_path, capsys, ca
     changes, reason = NPZ[case]
     np.savez(tmp_path / "own.npz", **{name: each for name, each in (ARRAYS | changes).items() if each is not None})
     assert reason in refused("judge", tmp_path / "own.npz", capsys=capsys)
+
+
+@pytest.mark.parametrize("target", ["0,0,1,0", "[0, 0, 1, 0]", "0 0 1 0"])
+def test_arrays_without_a_target_are_judged_by_the_one_that_is_given(tmp_path, capsys, target):
+    np.savez(tmp_path / "own.npz", **{name: each for name, each in ARRAYS.items() if name != "target_position"})
+    assert main(["judge", str(tmp_path / "own.npz"), "--target", target, "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["position"]["settled"] == 1
 
 
 def test_flights_that_hold_their_target_take_no_other_and_no_columns(tmp_path, monkeypatch, capsys):

@@ -108,12 +108,11 @@ def check_file(
         raise BadInput(f"{field}: {place.parent} is no folder. Give a file in a folder that exists.")
     if os.path.isdir(place):
         raise BadInput(f"{field}: {path} is a folder. Give a file.")
-    check_suffix(path, field, kind, suffixes)
-    if not mark or not os.path.exists(place) or _is_special(place):
-        return
-    if place.name in RUN_FILES and os.path.exists(place.with_name("run.json")):
+    exists = bool(mark) and os.path.exists(place) and not _is_special(place)
+    if exists and place.name in RUN_FILES and os.path.exists(place.with_name("run.json")):
         raise BadInput(f"{field}: {path} is a file of a run, which is not replaced. Give another path.")
-    if not _is_marked(place, mark):
+    check_suffix(path, field, kind, suffixes)
+    if exists and not _is_marked(place, mark):
         raise BadInput(
             f"{field}: {path} is there and is not {kind} of flytune. Give another path, or remove this file."
         )
