@@ -197,7 +197,7 @@ def test_the_margins_are_those_of_the_true_state(calm, task):
         hovering(task.vehicle, tuple(calm.position[2, 40])),
         **{name: tuple(getattr(calm, name)[2, 40]) for name in ("attitude", "velocity", "body_rate")},
     )
-    here = situation(task.target, state, jnp.zeros(4))
+    here = situation(task.reference(0), state, jnp.zeros(4))
     for name, margin in margins(task.termination, here).items():
         assert calm.margins[name][2, 40] == pytest.approx(float(margin), abs=1e-5)
 

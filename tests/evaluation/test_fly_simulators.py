@@ -174,7 +174,7 @@ def test_margins_are_those_of_the_recorded_state(task, simulator):
     assert set(flights.margins) == set(task.termination)
     parts = {name: tuple(getattr(flights, name)[1, 40]) for name in FIELDS[1:4]}
     state = dataclasses.replace(hovering(task.vehicle, tuple(flights.position[1, 40])), **parts)
-    for name, margin in margins(task.termination, situation(task.target, state, jnp.zeros(4))).items():
+    for name, margin in margins(task.termination, situation(task.reference(0), state, jnp.zeros(4))).items():
         assert flights.margins[name].shape == (8, 61)
         assert flights.margins[name][1, 40] == pytest.approx(float(margin), abs=1e-5)
 

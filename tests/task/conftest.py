@@ -28,6 +28,8 @@ def situation():
             "pitch": 0,
             "action_change": (0, 0, 0, 0),
         } | changes
+        resting = {"velocity_error": fields["velocity"], "body_rate_error": fields["body_rate"]}
+        fields = resting | fields
         return Situation(
             **{
                 name: tuple(map(jnp.float32, value)) if isinstance(value, tuple) else jnp.float32(value)

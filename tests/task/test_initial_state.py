@@ -12,11 +12,11 @@ from flytune.config import document
 from flytune.errors import BadInput
 from flytune.physics.vehicle import load_vehicle
 from flytune.task.initial_state import EVALUATION_INITIAL_STATES, InitialState
-from flytune.task.situation import Target
+from flytune.task.target import Point
 
 DRAW = jax.jit(lambda where, vehicle, target, keys: jax.vmap(lambda key: where.draw(vehicle, target, key))(keys))
 NUMBER = 20_000
-PAPERS_TARGET = Target(position=(0.0, 0.0, 1.0), yaw=0.0)  # R19
+PAPERS_TARGET = Point(position=(0.0, 0.0, 1.0), yaw=0.0)  # R19
 
 
 def draw(where, target=PAPERS_TARGET):
@@ -112,7 +112,7 @@ def test_a_vehicle_with_latency_starts_with_nothing_on_its_way():
 
 def test_starts_move_with_the_target_and_turn_with_its_heading(tasks):
     where = dataclasses.replace(tasks["baseline"].initial_state, largest_yaw=0.5)
-    position, angles, _ = draw(where, Target(position=(20.0, -3.0, 4.0), yaw=1.0))
+    position, angles, _ = draw(where, Point(position=(20.0, -3.0, 4.0), yaw=1.0))
     # the box of R15 is (-1, -1, 0.1) to (1, 1, 2) around (0, 0, 1)
     np.testing.assert_allclose(position.min(axis=0), (19, -4, 3.1), atol=2e-3)
     np.testing.assert_allclose(position.max(axis=0), (21, -2, 5), atol=2e-3)
@@ -124,7 +124,7 @@ def test_a_box_may_be_written_as_offsets_from_the_target():
         lowest_position=(-1.0, -2.0, 0.5), highest_position=(1.0, 2.0, 1.0), for_target=(0.0, 0.0, 0.0),
         largest_tilt=0.0, largest_yaw=0.0,
     )  # fmt: skip
-    position, _, _ = draw(offsets, Target(position=(5.0, 5.0, 5.0), yaw=0.0))
+    position, _, _ = draw(offsets, Point(position=(5.0, 5.0, 5.0), yaw=0.0))
     np.testing.assert_allclose(position.min(axis=0), (4, 3, 5.5), atol=3e-3)
     np.testing.assert_allclose(position.max(axis=0), (6, 7, 6), atol=3e-3)
 
@@ -134,6 +134,6 @@ def test_a_box_may_be_written_as_offsets_from_the_target():
 def test_trials_start_evenly_around_a_target_at_any_height_and_never_below_the_ground(name, floor, height):
     # R19: 1 m below to 1 m above the target; `clear` keeps 0.1 m from the ground wherever the target is
     low, high = max(height - 1, floor), height + 1
-    z = draw(EVALUATION_INITIAL_STATES[name], Target(position=(0.0, 0.0, height), yaw=0.0))[0][:, 2]
+    z = draw(EVALUATION_INITIAL_STATES[name], Point(position=(0.0, 0.0, height), yaw=0.0))[0][:, 2]
     np.testing.assert_allclose((z.min(), z.max()), (low, high), atol=3e-3)
     np.testing.assert_allclose((z.mean(), z.std()), ((low + high) / 2, (high - low) / math.sqrt(12)), rtol=0.02)

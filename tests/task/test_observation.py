@@ -12,11 +12,11 @@ from scipy.spatial.transform import Rotation
 from flytune.physics.dynamics import State, hovering
 from flytune.physics.vehicle import load_vehicle
 from flytune.task.observation import BLOCKS, NOISY, SIZE, ObservationNoise, draw_noise, observe
-from flytune.task.situation import Target
+from flytune.task.reference import Reference
 
 QUIET = np.zeros(NOISY)
 PAPER = ObservationNoise(position=1e-3, attitude=2e-3, velocity=1e-3, body_rate=2e-3)
-TARGET = Target(position=(0.0, 0.0, 1.0), yaw=0.0)
+TARGET = Reference(position=(0.0, 0.0, 1.0), yaw=0.0)
 ACTION = (0.1, -0.2, 0.3, -0.4)
 SEE = jax.jit(observe)
 
@@ -82,7 +82,7 @@ def test_the_attitude_is_seen_from_the_targets_heading():
     # heading 90 deg, vehicle at 120 deg with a little roll: what is left is 30 deg about z, then the roll
     seen = see(
         state(attitude=Rotation.from_euler("ZYX", [math.radians(120), 0.0, 0.1]).as_quat()),
-        target=Target(position=(0.0, 0.0, 1.0), yaw=math.radians(90)),
+        target=Reference(position=(0.0, 0.0, 1.0), yaw=math.radians(90)),
     )
     np.testing.assert_allclose(seen[3:7], Rotation.from_euler("ZYX", [math.radians(30), 0, 0.1]).as_quat(), atol=1e-6)
 

@@ -18,6 +18,7 @@ from flytune.simulation.simulator import VehicleStates, state_numbers
 from flytune.task.agreement import check_starts
 from flytune.task.files import load_task
 from flytune.task.observation import RATE, SIZE
+from flytune.task.target import target_at
 from flytune.task.task import Task
 
 if TYPE_CHECKING:
@@ -204,7 +205,8 @@ def _picture(task: Task, numbers: np.ndarray, trail: np.ndarray, steps: int, rew
     from flytune.adapters import picture  # here, because it needs Pillow
 
     state = VehicleStates.from_rows(np.nan_to_num(numbers).astype(float))
-    distance = np.linalg.norm(numbers[:3] - np.array(task.target.position, float))
+    target = target_at(task.target, steps * task.vehicle.control_period)
+    distance = np.linalg.norm(numbers[:3] - np.array(target.position, float))
     lines = (
         ("time", f"{steps * task.vehicle.control_period:.2f} s"),
         ("distance", f"{distance:.3f} m"),
@@ -212,4 +214,4 @@ def _picture(task: Task, numbers: np.ndarray, trail: np.ndarray, steps: int, rew
         ("reward", f"{reward:.3f}"),
     )
     way = np.nan_to_num(trail).astype(float)
-    return picture.draw(picture.Scene(vehicle=task.vehicle, target=task.target, state=state, trail=way, lines=lines))
+    return picture.draw(picture.Scene(vehicle=task.vehicle, target=target, state=state, trail=way, lines=lines))

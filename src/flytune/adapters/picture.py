@@ -12,7 +12,8 @@ from PIL import Image, ImageDraw, ImageFont
 from flytune.physics.rotors import places, reach
 from flytune.physics.vehicle import Vehicle
 from flytune.simulation.simulator import VehicleStates, rotation_matrix
-from flytune.task.situation import POSITION_BAND, Target
+from flytune.task.situation import POSITION_BAND
+from flytune.task.target import Point
 
 SIZE = 480  # pixels on each side
 FINER = 2  # drawn this much larger, then averaged down: smooth edges
@@ -35,7 +36,7 @@ class Scene:
     """What a picture shows."""
 
     vehicle: Vehicle
-    target: Target
+    target: Point  # where it is at this instant
     state: VehicleStates  # of one vehicle, without a first axis
     trail: Float[np.ndarray, "steps 3"]  # m, where the vehicle has been, oldest first
     lines: tuple[tuple[str, str], ...]  # of text: name and value

@@ -23,7 +23,14 @@ def label(**options: Any) -> Any:
     return dataclasses.field(metadata={"label": True}, **options)
 
 
-@dataclass_transform(frozen_default=True, kw_only_default=True, field_specifiers=(dataclasses.field, static, label))
+def derived() -> Any:
+    """A field that the class computes from its other fields; it is a leaf, and stands in no file."""
+    return dataclasses.field(default=None, compare=False, repr=False, metadata={"derived": True})
+
+
+@dataclass_transform(
+    frozen_default=True, kw_only_default=True, field_specifiers=(dataclasses.field, static, label, derived)
+)
 def pytree(cls: type[T]) -> type[T]:
     """The class as a frozen, keyword-only dataclass, registered as a JAX pytree.
 

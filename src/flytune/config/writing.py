@@ -11,11 +11,12 @@ from flytune.config.fields import allowed, annotations, unit_text
 
 def plain(node: Any) -> dict[str, Any]:
     """The nested tables a dataclass is written as, the inverse of `read`; empty optional fields are left out."""
-    values = ((field, getattr(node, field.name)) for field in dataclasses.fields(node))
+    fields = (field for field in dataclasses.fields(node) if not field.metadata.get("derived"))
+    values = ((field, getattr(node, field.name)) for field in fields)
     return {
         field.name: _plain_value(value)
         for field, value in values
-        if value is not None and not (_is_optional(field) and value in ({}, ""))
+        if value is not None and not (_is_optional(field) and (value in ({}, "") or value == field.default == ()))
     }
 
 

@@ -5,14 +5,16 @@ from collections.abc import Sequence
 
 from flytune.errors import BadInput
 from flytune.evaluation.comparison_table import MAY_DIFFER, comparison_text
-from flytune.evaluation.difference import METRICS, Difference, compare_metric
+from flytune.evaluation.difference import Difference, Metric, compare_metric, metrics_of
 from flytune.evaluation.judge import Judgement
 
-SHARED = {  # what has to be the same: the option that sets it, and its unit
-    "trials": ("trials", ""),
-    "seed": ("seed", ""),
-    "initial_conditions": ("starts", ""),
-    "duration": ("duration", " s"),
+SHARED = {  # what has to be the same: how it is called, the option that sets it, and its unit
+    "task": ("task", "task", ""),
+    "vehicle": ("vehicle", "task", ""),
+    "trials": ("trials", "trials", ""),
+    "seed": ("seed", "seed", ""),
+    "initial_conditions": ("starts", "starts", ""),
+    "duration": ("duration", "duration", " s"),
 }
 
 
@@ -26,6 +28,11 @@ class Comparison:
 
     def __repr__(self) -> str:
         return f"Comparison({', '.join(self.names)}; with {self.names[self.reference]})"
+
+    @property
+    def metrics(self) -> tuple[Metric, ...]:
+        """What is compared: the tracking error too, where the target moves for all of them."""
+        return metrics_of(self.judgements)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -52,9 +59,9 @@ def compare(judgements: Sequence[Judgement], *, reference: int = 0) -> Compariso
     """The comparison of two or more controllers over the same trials.
 
     Initial state and noise of a trial depend on seed and trial alone. So trial i of one controller is paired with
-    trial i of the reference, and their difference does not contain the spread of the initial states. Simulator, task
-    and vehicle may differ. Names that occur twice are made different. `reference` is the index of the controller that
-    the others are compared with.
+    trial i of the reference, and their difference does not contain the spread of the initial states. Task, vehicle,
+    duration and initial conditions are the same for all; the simulator may differ. Names that occur twice are made
+    different. `reference` is the index of the controller that the others are compared with.
 
     Raises:
         BadInput: fewer than two, no such reference, or trials that are not the same.
@@ -67,17 +74,19 @@ def compare(judgements: Sequence[Judgement], *, reference: int = 0) -> Compariso
         raise BadInput(f"reference: {reference} is not allowed. Allowed: 0 to {len(judgements) - 1}, a controller.")
     named = _distinguish(judgements)
     first = named[0]
-    for field, (option, unit) in SHARED.items():
+    for field, (label, option, unit) in SHARED.items():
         wanted = getattr(first, field)
         for other in named:
             if (value := getattr(other, field)) != wanted:
                 raise BadInput(
-                    f"{option}: {wanted}{unit} for {first.name} and {value}{unit} for {other.name} is not allowed. "
+                    f"{label}: {wanted}{unit} for {first.name} and {value}{unit} for {other.name} is not allowed. "
                     f"Allowed: the same for every controller. Fly all of them with one --{option}."
                 )
     against = named[reference]
     others = [controller for controller in named if controller is not against]
-    differences = tuple(compare_metric(controller, against, metric) for controller in others for metric in METRICS)
+    differences = tuple(
+        compare_metric(controller, against, metric) for controller in others for metric in metrics_of(named)
+    )
     return Comparison(judgements=tuple(named), reference=reference, differences=differences)
 
 

@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+from collections.abc import Sequence
 
 import numpy as np
 from jaxtyping import Float
@@ -15,6 +16,7 @@ FIELDS = {  # of the judgement: in words, and how a controller with more of it c
     "overshoot": ("overshoot", "more", "less"),
     "steady_state_error": ("steady-state error", "farther off", "nearer"),
     "rms_error": ("RMS error", "larger", "smaller"),
+    "tracking_error": ("tracking error", "farther off", "nearer"),
     "peak_speed": ("peak speed", "faster", "slower"),
     "action_rms": ("action, RMS", "harder", "more gently"),
     "action_total_variation": ("action, change", "more", "less"),
@@ -50,6 +52,18 @@ class Metric:
         return FIELDS[self.field][1:]
 
     @property
+    def outcomes(self) -> tuple[str, str]:
+        """What a controller does in a trial without a number, and what in one with a number, for a sentence."""
+        if self.field == "settling_time":
+            return self.verb.replace("settles", "does not settle"), self.verb
+        return "crashes", "does not"
+
+    @property
+    def neither(self) -> str:
+        """What is said of two controllers that both have no number."""
+        return f"neither {self.verb}" if self.field == "settling_time" else "both crash"
+
+    @property
     def shown(self) -> tuple[str, float]:
         """The unit of tables and figures, and its factor."""
         return ("%", 100.0) if self.field == "overshoot" else SHOWN.get(self.unit, (self.unit, 1.0))
@@ -59,6 +73,8 @@ class Metric:
 
         Speed and action stop at a crash, which makes them small: they are NaN for a crashed trial.
         """
+        if self.field == "tracking_error":
+            return judgement.tracking.mean_error if judgement.tracking else np.full(judgement.trials, np.nan)
         values = getattr(judgement, self.field)
         return values[self.channel] if self.channel else np.where(judgement.crashed, np.nan, values)
 
@@ -79,6 +95,14 @@ METRICS = (
 )
 
 
+TRACKING = Metric("tracking_error", None, "m", "tracks", "as closely as")
+
+
+def metrics_of(judgements: Sequence[Judgement]) -> tuple[Metric, ...]:
+    """The metrics in which controllers are compared; the mean tracking error where the target moves for all."""
+    return (*METRICS, TRACKING) if all(judgement.tracking for judgement in judgements) else METRICS
+
+
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Difference:
     """One metric of a controller less that of the reference, trial by trial; negative is better.
@@ -96,6 +120,7 @@ class Difference:
     worse: int
     tied: int  # trials with equal values, or in which both failed
     left_out: int  # trials to which the metric does not apply
+    both_failed: int = 0  # of the tied ones
 
     @property
     def compared(self) -> int:
@@ -127,10 +152,12 @@ def paired_difference(controller: PerTrial, reference: PerTrial) -> PerTrial:
 
 def compare_metric(controller: Judgement, reference: Judgement, metric: Metric) -> Difference:
     """How a controller differs from the reference in one metric, with the 95 % bootstrap interval of the median."""
-    paired = paired_difference(metric.values(controller), metric.values(reference))
+    mine, other = metric.values(controller), metric.values(reference)
+    paired = paired_difference(mine, other)
     left_out = np.isnan(paired)
     middle, low, high = median_and_interval(paired[~left_out])
-    flags = {"better": paired < 0, "worse": paired > 0, "tied": paired == 0, "left_out": left_out}
+    flags = {"better": paired < 0, "worse": paired > 0, "tied": paired == 0, "left_out": left_out,
+             "both_failed": np.isposinf(mine) & np.isposinf(other)}  # fmt: skip
     counts = {name: int(np.count_nonzero(flag)) for name, flag in flags.items()}
     return Difference(name=controller.name, metric=metric, median=middle, low=low, high=high, **counts)
 

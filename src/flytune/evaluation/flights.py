@@ -54,8 +54,8 @@ class Flights(Labels):
     action: np.ndarray  # [N, T + 1, 4] in [-1, 1]; sample k is the action that led to sample k, sample 0 is hover (0)
     crashed: np.ndarray  # [N] bool
     margins: dict[str, np.ndarray]  # termination name -> [N, T + 1], share of the bound left, negative beyond it
-    target_position: np.ndarray  # [3] m
-    target_yaw: float  # rad
+    target_position: np.ndarray  # [3] m; of a target that moves [T + 1, 3]
+    target_yaw: Any  # rad; of a target that moves [T + 1]
     speed_bound: float | None  # m/s, of the task's speed termination; None where it has none
     missing: tuple[str, ...] = ()  # fields that a log lacks, of `velocity` and those below it; they are NaN
 
@@ -74,6 +74,47 @@ class Flights(Labels):
     def duration(self) -> float:
         """Length of each trial in seconds."""
         return float(self.time[-1])
+
+    @property
+    def moving(self) -> bool:
+        """Whether the target moves, or steps."""
+        return self.target_position.ndim == 2
+
+    @property
+    def start_error(self) -> np.ndarray:
+        """The way from the target to each start, [N, 3] in m, where the target is at the start."""
+        return self.position[:, 0] - (self.target_position[0] if self.moving else self.target_position)
+
+    @property
+    def steps(self) -> list["Flights"]:
+        """The flights to each place of a target that steps, each from time 0 on; none of one that moves otherwise.
+
+        A trial counts as crashed in the step in which it crashed, and in those that follow.
+        """
+        if not self.moving:
+            return []
+        changed = np.diff(np.column_stack([self.target_position, self.target_yaw]), axis=0).any(axis=1)
+        begins = [0, *(np.flatnonzero(changed) + 1).tolist()]
+        if (np.diff(begins) < 2).any():
+            return []
+        held = (self.position == self.position[:, -1:]).all(axis=-1)
+        lost = np.where(held.all(axis=1), 0, held.shape[1] - np.argmin(held[:, ::-1], axis=1))  # the first held sample
+        ends = [*begins[1:], self.time.size]
+        return [
+            self._part(slice(begin, end), self.crashed & (lost < end)) for begin, end in zip(begins, ends, strict=True)
+        ]
+
+    def _part(self, part: slice, crashed: np.ndarray) -> "Flights":
+        fields = {name: getattr(self, name)[:, part] for name in COLUMNS}
+        return dataclasses.replace(
+            self,
+            **fields,
+            time=self.time[part] - self.time[part.start],
+            crashed=crashed,
+            margins={name: margin[:, part] for name, margin in self.margins.items()},
+            target_position=self.target_position[part.start],
+            target_yaw=float(self.target_yaw[part.start]),
+        )
 
     def save(self, path: Path) -> None:
         """Write the trajectories as .npz: `data` [N, T + 1, C] with `columns` [C], `units` [C] and labels.
@@ -131,7 +172,15 @@ class Flights(Labels):
                    if name.startswith("margin_")}  # fmt: skip
         seed, bound, position = int(arrays["seed"]), float(arrays["speed_bound"]), np.asarray(arrays["target_position"])
         time, crashed = np.asarray(arrays["time"], np.float64), np.asarray(arrays["crashed"], bool)
-        if time.shape != (samples,) or crashed.shape != (trials,) or position.shape != (3,):
+        if (
+            time.shape != (samples,)
+            or crashed.shape != (trials,)
+            or position.shape
+            not in (
+                (3,),
+                (samples, 3),
+            )
+        ):
             raise ValueError(f"time {time.shape}, crashed {crashed.shape} or target_position {position.shape}")
         return cls(
             **fields,
@@ -139,7 +188,9 @@ class Flights(Labels):
             crashed=crashed,
             margins=margins,
             target_position=position,
-            target_yaw=float(arrays["target_yaw"]),
+            target_yaw=np.asarray(arrays["target_yaw"], np.float64)
+            if position.ndim == 2
+            else float(arrays["target_yaw"]),
             speed_bound=None if np.isnan(bound) else bound,
             missing=tuple(missing),
             name=str(arrays["who"]),

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from flytune.control.controller import Controller
+from flytune.control.policy import check_actions_fit
 from flytune.control.schedule import ScheduledPolicy, settings_along, shown_setting
 from flytune.errors import BadInput, Diverged
 from flytune.evaluation.flights import Flights
@@ -26,6 +27,7 @@ from flytune.simulation.simulator import WIDTHS, Simulator, VehicleStates, state
 from flytune.simulation.simulators import make_simulator
 from flytune.task.initial_state import EVALUATION_INITIAL_STATES, InitialState
 from flytune.task.observation import SIZE, draw_noise
+from flytune.task.target import sampled
 from flytune.task.task import Task
 
 ACTION = slice(SIZE - 4, SIZE)  # of an observation: the last action, which carries no noise
@@ -74,11 +76,14 @@ def fly(
     starts_name = "own" if own else initial_conditions
     _check_arguments(trials, seed, "clear" if own else starts_name, duration)
     _check_controller(controller)
+    check_actions_fit(getattr(getattr(controller, "policy", controller), "about", {}), task.vehicle, name)
     period = task.vehicle.control_period
     steps = round(duration / period)
     initial_state = initial_conditions if own else EVALUATION_INITIAL_STATES[initial_conditions]
     if problem := initial_state.problem() or initial_state.problem_around(task.target):
         raise BadInput(f"starts {starts_name}: {problem}")
+    if problem := task.problem_of_path(duration):
+        raise BadInput(problem)
     task = dataclasses.replace(task, initial_state=initial_state)
     starts, noise_keys = _begin(task, trial_keys(seed, trials))
     simulator_name, made = _made(simulator, task.vehicle, trials, simulator_options)
@@ -89,14 +94,16 @@ def fly(
     states, actions = np.asarray(record.states), np.asarray(record.actions)
     along = settings_along(controller, family, steps + 1) if isinstance(controller, ScheduledPolicy) else {}
     trajectories = VehicleStates.from_rows(np.ascontiguousarray(states.transpose(2, 0, 1)))
+    time = np.arange(steps + 1) * period
+    place, yaw = sampled(task.target, time)
     return Flights(
-        time=np.arange(steps + 1) * period,
+        time=time,
         **{field: getattr(trajectories, field) for field in WIDTHS},
         action=np.ascontiguousarray(actions.transpose(2, 0, 1)),
         crashed=np.asarray(record.crashed),
         margins=recorded_margins(family if along else task, along, states, actions),
-        target_position=np.asarray(task.target.position),
-        target_yaw=float(task.target.yaw),
+        target_position=place,
+        target_yaw=yaw,
         speed_bound=largest_speed_bound(family, along) if along else task.speed_bound,
         name=name,
         task=task.name,
@@ -249,7 +256,7 @@ def _episodes(task: Task, starts: jax.Array) -> jax.Array:
 def _started(task: Task, starts: jax.Array) -> Episode:
     def one(numbers: jax.Array) -> Episode:
         state = state_from(numbers, no_pending_actions(task.vehicle))
-        crashed = is_crashed(task, state)
+        crashed = is_crashed(task, state, 0)
         episode = begin(task.vehicle, state)
         return dataclasses.replace(episode, steps=jnp.where(crashed, -1, episode.steps))
 

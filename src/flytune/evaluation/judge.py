@@ -1,7 +1,7 @@
 """The judge: one Judgement of Flights, by the same definitions for every controller and simulator. NumPy only."""
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -11,6 +11,7 @@ from flytune.evaluation import lower_bounds, metrics
 from flytune.evaluation.flights import Flights, Labels
 from flytune.evaluation.statistics import finite, median, summary
 from flytune.evaluation.table import AXES, response_line, response_text
+from flytune.evaluation.tracking import Tracking, track
 from flytune.simulation import CRASH_DISTANCE
 
 CHANNELS = (*AXES, "position")
@@ -63,6 +64,8 @@ class Judgement(Labels):
     infeasible: PerTrialFlag
     crashed: PerTrialFlag
     violated: Mapping[str, PerTrialFlag]  # termination -> crossed at some sample
+    tracking: Tracking | None = None  # of a target that moves
+    steps: tuple["StepJudgement", ...] = ()  # of a target that steps
 
     def __repr__(self) -> str:
         settled, took = self.settled("position"), median(self.settling_time["position"])
@@ -114,6 +117,8 @@ class Judgement(Labels):
             "efficiency": {"median": median(self.efficiency)},
             "dial": dict(self.dial) or None,
             **({"made_for": self.made_for} if self.made_for else {}),
+            **({"tracking": self.tracking.to_dict()} if self.tracking else {}),
+            **({"steps": [step.to_dict() for step in self.steps]} if self.steps else {}),
         }
 
     def _response(self, channel: str) -> dict:
@@ -131,6 +136,21 @@ class Judgement(Labels):
         return response_line(self.to_dict())
 
 
+@dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
+class StepJudgement:
+    """The response to one step of a target that steps, on its own: times count from the step."""
+
+    begin: float  # s from the start of the trial
+    target: tuple[float, ...]  # x, y, z in m and yaw in rad
+    judgement: Judgement
+
+    def to_dict(self) -> dict:
+        """Plain Python values, as in `Judgement.to_dict`."""
+        whole = self.judgement.to_dict()
+        kept = ("duration", "axes", "position", "crashed", "infeasible")
+        return {"begin": self.begin, "target": list(self.target), **{name: whole[name] for name in kept}}
+
+
 def judge(flights: Flights) -> Judgement:
     """Judgement of recorded flights, by the same definitions for every controller and simulator.
 
@@ -141,6 +161,9 @@ def judge(flights: Flights) -> Judgement:
     In the secondary bands every trial counts, with a band in proportion to its own step (for yaw the wrapped error at
     the start): a tiny step has a tiny band, which sensor noise alone may leave.
 
+    Of a target that moves, errors are those from its place at each instant; rise time, overshoot and efficiency do not
+    apply. `tracking` tells how it is followed, or `steps` the response to each of its steps.
+
     Source: docs, definitions; C5 of the paper's open points for the bands.
     """
     time = np.asarray(flights.time, dtype=np.float64)
@@ -149,11 +172,19 @@ def judge(flights: Flights) -> Judgement:
     responses = {name: channel.response(time, crashed) for name, channel in _channels(flights, time, crashed).items()}
     action, velocity = _double(flights.action), _double(flights.velocity)
     unknown = np.full(flights.trials, np.nan)  # of what the log of a flight lacks
-    start = np.asarray(flights.position[:, 0], dtype=np.float64) - flights.target_position
-    bound = lower_bounds.settling_time_bound(np.linalg.norm(start, axis=-1), flights.speed_bound)
+    start = np.asarray(flights.start_error, dtype=np.float64)
+    bound = (
+        np.zeros(flights.trials)
+        if flights.moving
+        else lower_bounds.settling_time_bound(np.linalg.norm(start, axis=-1), flights.speed_bound)
+    )
     fields: dict[str, Any] = {field.name: getattr(flights, field.name) for field in dataclasses.fields(Labels)}
     for field in (*RESPONSE, "small_step"):
         fields[field] = {name: responses[name][field] for name in (AXES if field in OF_AXES else CHANNELS)}
+    if flights.moving:
+        for field in ("rise_time", "overshoot", "overshoot_raw"):
+            fields[field] = {name: np.full(flights.trials, np.nan) for name in fields[field]}
+    parts = flights.steps
     return Judgement(
         **fields,
         duration=duration,
@@ -167,6 +198,21 @@ def judge(flights: Flights) -> Judgement:
         infeasible=lower_bounds.infeasible(bound, duration, flights.margins),
         crashed=crashed,
         violated={name: np.any(margin < 0, axis=1) for name, margin in flights.margins.items()},
+        tracking=track(flights, crashed) if flights.moving and not parts else None,
+        steps=_judge_steps(parts),
+    )
+
+
+def _judge_steps(parts: Sequence[Flights]) -> tuple[StepJudgement, ...]:
+    """The judgement of each step; a step ends with the sample before the next one."""
+    begins = np.cumsum([0.0, *(part.time[-1] + part.time[1] for part in parts[:-1])]) if parts else []
+    return tuple(
+        StepJudgement(
+            begin=round(float(begin), 6),
+            target=(*part.target_position.tolist(), part.target_yaw),
+            judgement=judge(part),
+        )
+        for begin, part in zip(begins, parts, strict=True)
     )
 
 
@@ -206,7 +252,8 @@ def _channels(flights: Flights, time: Float[np.ndarray, "K"], crashed: PerTrialF
     error = np.where(lost, 0.0, _double(flights.position) - flights.target_position)
     attitude = np.where(lost, [0.0, 0.0, 0.0, 1.0], _double(flights.attitude))
     yaw = metrics.yaw_angle(attitude)
-    turn, wrapped = metrics.unwrapped_yaw_error(yaw, flights.target_yaw), metrics.wrap_angle(yaw - flights.target_yaw)
+    turned, aim = (yaw - flights.target_yaw, 0.0) if flights.moving else (yaw, flights.target_yaw)
+    turn, wrapped = metrics.unwrapped_yaw_error(turned, aim), metrics.wrap_angle(yaw - flights.target_yaw)
     along, distance = metrics.error_along_start(error), np.linalg.norm(error, axis=-1)
     steady_yaw = metrics.steady_state_yaw_error(wrapped, time)
     return {

@@ -93,14 +93,16 @@ def joined(flights: Sequence[Flights], name: str, on_message: Callable[[str], No
         BadInput: the targets differ.
     """
     first, *others = flights
-    for other in others:
-        same = np.allclose(other.target_position, first.target_position, atol=1e-6)
-        if not (same and np.isclose(other.target_yaw, first.target_yaw, atol=1e-6)):
-            raise BadInput(
-                f"target: {first.name} and {other.name} have different targets ({first.target_position.tolist()} and "
-                f"{other.target_position.tolist()}). Judge each of them alone, or give one --target."
-            )
     samples = min(one.time.size for one in flights)
+    target = _target(first, samples)
+    for other in others:
+        there = _target(other, samples)
+        if there.shape != target.shape or not np.allclose(there, target, atol=1e-6):
+            shown = "" if first.moving or other.moving else f" ({target[:3].tolist()} and {there[:3].tolist()})"
+            raise BadInput(
+                f"target: {first.name} and {other.name} have different targets{shown}. Judge each of them alone, or "
+                "give one --target."
+            )
     if any(one.time.size > samples for one in flights):
         on_message(f"{name}: all flights are cut to the shortest, {flights[0].time[samples - 1]:g} s")
     missing = tuple(field for field in OPTIONAL if any(field in one.missing for one in flights))
@@ -108,7 +110,16 @@ def joined(flights: Sequence[Flights], name: str, on_message: Callable[[str], No
     stacked |= {field: np.full_like(stacked[field], np.nan) for field in missing}
     crashed = np.concatenate([one.crashed for one in flights])
     time = first.time[:samples]
+    if first.moving:
+        stacked |= {"target_position": target[:, :3], "target_yaw": target[:, 3]}
     return dataclasses.replace(first, **stacked, time=time, crashed=crashed, missing=missing, name=name)
+
+
+def _target(flights: Flights, samples: int) -> np.ndarray:
+    """x, y, z and yaw of a target, [4]; of one that moves those of the first samples, [samples, 4]."""
+    if not flights.moving:
+        return np.append(flights.target_position, flights.target_yaw)
+    return np.column_stack([flights.target_position, flights.target_yaw])[:samples]
 
 
 def _one(

@@ -35,7 +35,7 @@ def recorded_margins(
     for first in range(0, samples, CHUNK):
         rows = np.minimum(np.arange(first, first + CHUNK), samples - 1)
         here = {name: np.asarray(values[rows], np.float32) for name, values in settings.items()}
-        parts.append(_margins(task, here, states[rows], changes[rows]))
+        parts.append(_margins(task, here, states[rows], changes[rows], rows.astype(np.int32)))
     return {name: np.concatenate([np.asarray(part[name]) for part in parts], axis=-1)[:, :samples] for name in parts[0]}
 
 
@@ -51,11 +51,13 @@ def largest_speed_bound(task: Task, settings: Mapping[str, np.ndarray]) -> float
 
 
 @program()
-def _margins(task: Task, settings: dict[str, jax.Array], states: jax.Array, changes: jax.Array) -> dict[str, jax.Array]:
+def _margins(
+    task: Task, settings: dict[str, jax.Array], states: jax.Array, changes: jax.Array, steps: jax.Array
+) -> dict[str, jax.Array]:
     """The margins [N, samples] of states [samples, 17, N] under changes of the action [samples, 4, N]."""
 
     def one(numbers: jax.Array, changes: jax.Array) -> dict[str, jax.Array]:
         none_pending = jnp.zeros((len(changes), task.vehicle.action_latency_steps, 4))
-        return margins_along(task, settings, state_from(numbers.T, none_pending), changes)
+        return margins_along(task, settings, state_from(numbers.T, none_pending), changes, steps)
 
     return jax.vmap(one, in_axes=-1)(states, changes)

@@ -7,6 +7,7 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
+from flytune.evaluation.path_table import path_tables
 from flytune.tables import Column, Table, number
 
 AXES = ("x", "y", "z", "yaw")
@@ -56,16 +57,19 @@ def response_text(judged: Mapping[str, Any]) -> str:
         trials = "1 flight" if judged["trials"] == 1 else f"{judged['trials']} flights"
         heading = f"{judged['who']}: {trials} of {judged['duration']:g} s, {judged['starts']}"
     crossed = ", ".join(f"{name} {count}" for name, count in judged["violations"].items()) or "none"
-    small = ", ".join(f"{axis} {judged['axes'][axis]['small_steps']}" for axis in AXES)
+    small = {axis: judged["axes"][axis]["small_steps"] for axis in AXES}
     peak, action = judged["peak_speed"], judged["action"]
     footer = [
         f"crashed {judged['crashed']}   infeasible {judged['infeasible']}   trials that crossed a bound: {crossed}",
         f"peak speed {number(peak['median'], 2)} m/s (p95 {number(peak['p95'], 2)})   action rms "
         f"{number(action['rms'], 3)}, total variation {number(action['total_variation'], 4)}   "
         f"efficiency {number(judged['efficiency']['median'], 2)}",
-        f"steps too small for overshoot and rise: {small}",
     ]
-    return "\n".join([heading, "", response_table(judged).text(), "", *footer])
+    if any(small.values()):
+        told = ", ".join(f"{axis} {count}" for axis, count in small.items())
+        footer.append(f"steps too small for overshoot and rise: {told}")
+    tables = [response_table(judged), *path_tables([judged])]
+    return "\n".join([heading, "", *(f"{table.text()}\n" for table in tables), *footer])
 
 
 def _shown(setting: Any) -> str:

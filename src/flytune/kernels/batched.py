@@ -21,6 +21,7 @@ from jaxtyping import Array
 from flytune.kernels.emit import Unsupported
 from flytune.kernels.native import loop, module, register
 
+LARGEST = 400  # numbers of an array that all elements share; a kernel holds each as a value of its own
 SWITCH = "FLYTUNE_KERNELS"  # 0 in the environment switches kernels off
 
 Flat = Sequence[Any]
@@ -46,7 +47,7 @@ def batched(function: Callable[..., Any], shared: Any = ()) -> Callable[..., Any
         axis).
     """
     plain = jax.checkpoint(jax.vmap(functools.partial(function, shared), in_axes=-1, out_axes=-1), prevent_cse=False)
-    if not available():
+    if not available() or has_table(shared):
         return plain
     prepared = Prepared(function, shared)
 
@@ -60,6 +61,11 @@ def batched(function: Callable[..., Any], shared: Any = ()) -> Callable[..., Any
         return jax.tree.unflatten(kernel.form, outputs)
 
     return call
+
+
+def has_table(shared: Any) -> bool:
+    """Whether an array among what all elements share is so large that one looks values up in it; JAX does that."""
+    return any(jnp.size(leaf) > LARGEST for leaf in jax.tree.leaves(shared))
 
 
 class Prepared:

@@ -15,8 +15,9 @@ import jax.numpy as jnp
 from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, Float, UInt32
 
-from flytune.kernels.batched import Kernel, Prepared, words
+from flytune.kernels.batched import Kernel, Prepared, has_table, words
 from flytune.kernels.dense import Actor, backward_function, forward_function, parameters_of
+from flytune.kernels.emit import Unsupported
 from flytune.kernels.native import loop, module, register
 from flytune.kernels.writer import Writer
 
@@ -47,6 +48,8 @@ def window(
         Unsupported: a primitive of `look` or `move` has no form as a loop.
         NotImplementedError: a gradient with respect to `shared` is asked for.
     """
+    if has_table(shared):
+        raise Unsupported("a look-up in a table")
     action = jnp.zeros((actor.sizes[-1], episodes.shape[-1]))
     seeing, moving = Prepared(look, shared), Prepared(move, shared)
     spec = _Spec(

@@ -163,7 +163,15 @@ def implausible(vehicle: Vehicle) -> str | None:
     values = ", ".join(_value(vehicle, name) for name in slip.fields)
     write = ", ".join(f"{_field(vehicle, name)} = {_value(changed, name)}" for name in slip.fields)
     are, they = ("is", "Is it") if len(slip.fields) == 1 else ("are", "Are they")
-    return f"{names}: {values} {are} not plausible: {first.described}. {they} in {slip.unit}? Then write {write}."
+    # a propeller of 10 inches has a radius of 12.7 cm: a number of 10 may mean this, or a radius of 10 cm
+    near = (
+        f", or {_value(other, each.fields[0])} if it is {each.words}"
+        for each, other in _repaired(vehicle)
+        if each is not slip and each.fields == slip.fields == ("propeller_radius",) and not _wrong(other)
+        and abs(math.log(each.factors[0] / slip.factors[0])) < math.log(1.5)
+    )  # fmt: skip
+    write += "".join(near)
+    return f"{names}: {values} {are} not plausible: {first.described}. {they} {slip.words}? Then write {write}."
 
 
 def _too_weak(vehicle: Vehicle) -> str:
@@ -176,7 +184,7 @@ def _too_weak(vehicle: Vehicle) -> str:
             f"Allowed: above the hover speed, {hover:.0f} rpm, by 1 % or more."
         )
     return (
-        f"action_scale: {_rounded(vehicle.action_scale)} cannot lift the vehicle: full action gives "
+        f"action_scale: {_rounded(vehicle.action_scale or 0.0)} cannot lift the vehicle: full action gives "
         f"{vehicle.full_thrust_to_weight:.3g} times its weight. Allowed: {least - 1:.2g} or more."
     )
 
@@ -188,12 +196,20 @@ class _Slip:
     fields: tuple[str, ...]
     unit: str
     factors: tuple[float, ...]
+    diameter: bool = False  # given in place of a radius
+
+    @property
+    def words(self) -> str:
+        """What the number is then, for a question."""
+        return f"the diameter in {self.unit}" if self.diameter else f"in {self.unit}"
 
 
 _RPM = 1 / RAD_PER_S  # in one rad/s
 _SLIPS = (
     *(_Slip((name,), unit, (factor,)) for name in ("arm", "propeller_radius")
       for unit, factor in (("mm", 1e-3), ("cm", 1e-2), ("inches", 0.0254))),
+    *(_Slip(("propeller_radius",), unit, (factor / 2,), diameter=True)
+      for unit, factor in (("mm", 1e-3), ("cm", 1e-2), ("inches", 0.0254), ("m", 1.0))),
     *(_Slip(("arm", "propeller_radius"), unit, (factor, factor))
       for unit, factor in (("mm", 1e-3), ("cm", 1e-2), ("inches", 0.0254))),
     _Slip(("mass",), "g", (1e-3,)),

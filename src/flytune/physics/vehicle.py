@@ -77,7 +77,12 @@ class Vehicle:
         ]
         | None
     ) = None  # Ixy, Ixz, Iyz, as they stand in the matrix of inertia; 0 where missing
-    arm: Annotated[Real | None, Gt(0), Unit("m")] = None  # x configuration: from the centre to each motor
+    arm: Annotated[  # x configuration
+        Real | None,
+        Gt(0),
+        Unit("m"),
+        doc("from the centre of mass to each motor, half of a diagonal from motor to motor"),
+    ] = None
     rotors: Rotors | None = None  # another layout, in place of `arm`
     thrust_coefficient: Annotated[Real, Gt(0), Unit("N/rpm^2")]
     thrust_linear: Annotated[Real | None, Unit("N/rpm")] = None  # thrust = thrust_coefficient n^2 + thrust_linear n

@@ -10,7 +10,7 @@ from jaxtyping import Float
 
 from flytune.evaluation import metrics
 from flytune.evaluation.comparison import Comparison
-from flytune.evaluation.difference import METRICS, Difference
+from flytune.evaluation.difference import Difference
 from flytune.evaluation.flights import Flights
 from flytune.evaluation.judge import CHANNELS
 from flytune.report import plots, style
@@ -44,7 +44,7 @@ def responses(flights: Sequence[Flights], comparison: Comparison) -> go.Figure:
             figure.add_trace(_trials(flown, channel, shown, index), row=row, col=1)
             errors += _errors(flown, comparison.judgements[index].crashed, channel, index, opacity)
         figure.add_traces(errors, rows=row, cols=2)
-        plots.target_and_band(figure, row, 1, target, band)
+        plots.target_and_band(figure, row, 1, target, band, flights[0])
         low, high = _reach(errors, band)
         place = style.at(row, 2)
         figure.add_hrect(low / 2, band, fillcolor=style.BAND, line_width=0, layer="below", **place)
@@ -63,7 +63,7 @@ def _reach(errors: Sequence[go.Scatter], band: float) -> tuple[float, float]:
     return known.min() / 1.6, known.max() * 1.6
 
 
-def _course(flights: Flights, channel: str) -> tuple[Float[np.ndarray, "N K"], float, float]:
+def _course(flights: Flights, channel: str) -> tuple[Float[np.ndarray, "N K"], Any, float]:
     """Values, target and band of an axis, or the distance from the target, which is to be 0."""
     if channel != "position":
         return plots.course(flights, channel)
@@ -113,7 +113,7 @@ def _errors(flights: Flights, crashed: np.ndarray, channel: str, index: int, opa
 
 def boxes(comparison: Comparison) -> go.Figure | str:
     """Box plots of each metric, the controllers side by side, with the number of trials that each box holds."""
-    chosen = [metric for metric in METRICS if metric.name in BOXES]
+    chosen = [metric for metric in comparison.metrics if metric.name in BOXES]
     titles = [metric.title for metric in chosen]
     figure = style.panels(2, 4, titles, vertical_spacing=0.2, horizontal_spacing=0.07)
     drawn = 0
@@ -133,13 +133,13 @@ def boxes(comparison: Comparison) -> go.Figure | str:
 def paired(comparison: Comparison) -> go.Figure:
     """Median difference of each controller from the reference, metric by metric, with its interval; zero is as good."""
     columns = 4
-    rows = math.ceil(len(METRICS) / columns)
+    rows = math.ceil(len(comparison.metrics) / columns)
     others = [index for index in range(len(comparison.names)) if index != comparison.reference]
     gap = 92  # px between the panels of a column, for ticks and titles
     height = rows * (38 + 24 * len(others)) + (rows - 1) * gap
-    titles = [metric.title for metric in METRICS]
+    titles = [metric.title for metric in comparison.metrics]
     figure = style.panels(rows, columns, titles, vertical_spacing=gap / height, horizontal_spacing=0.05)
-    for panel, metric in enumerate(METRICS):
+    for panel, metric in enumerate(comparison.metrics):
         row, column = divmod(panel, columns)
         place = style.at(row + 1, column + 1)
         found = [one for one in comparison.differences if one.metric is metric]
@@ -194,7 +194,10 @@ def _finish(
     The legend has entries of its own, since a controller may have nothing to draw in a panel.
     """
     texts = [f"<b>{number}</b> {label(name)}" for number, name in enumerate(names, start=1)]
-    figure.for_each_trace(lambda trace: trace.update(name=texts[trace.meta], legendgroup=str(trace.meta), meta=None))
+    traces: Any = figure.select_traces()
+    for trace in traces:
+        if trace.meta is not None:  # a target that moves is nobody's
+            trace.update(name=texts[trace.meta], legendgroup=str(trace.meta), meta=None)
     figure.update_traces(showlegend=False)
     for controller in controllers:
         marker = {"color": style.colour(controller), "symbol": "square", "size": 11}

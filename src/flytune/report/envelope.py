@@ -83,7 +83,7 @@ def flights_3d(flights: Flights) -> go.Figure:
         path = flights.position[trial, ::step]
         figure.add_trace(_path(path, style.TRIALS[trial], 4.0, f"trial {trial + 1}", group=str(trial)))
         figure.add_trace(_mark(path[0], style.TRIALS[trial], "circle", f"start of trial {trial + 1}", str(trial)))
-    figure.add_trace(_mark(flights.target_position, style.BOUND, "diamond", "target", "target", legend=True))
+    _draw_target(figure, flights)
     axis = {"gridcolor": style.HAIRLINE, "zeroline": False, "showbackground": False, "linecolor": style.QUIET}
     scene: Mapping[str, Any] = {
         **{f"{name}axis": {**axis, "title": {"text": f"{name} [m]"}} for name in "xyz"},
@@ -91,6 +91,19 @@ def flights_3d(flights: Flights) -> go.Figure:
         "camera": {"eye": {"x": 1.2, "y": -1.4, "z": 0.72}, "center": {"x": 0, "y": 0, "z": -0.24}},
     }
     return style.frame(figure, 560, scene=scene, margin={"l": 0, "r": 0, "t": 40, "b": 0})
+
+
+def _draw_target(figure: go.Figure, flights: Flights) -> None:
+    """The target: a mark for each of its places, or the line that it moves along."""
+    steps = flights.steps
+    if flights.moving and not steps:
+        path = flights.target_position[:: stride(flights)]
+        figure.add_trace(_path(path, style.BOUND, 3.0, "path of the target", group="target"))
+        figure.add_trace(_mark(path[0], style.BOUND, "diamond", "start of the path", "target"))
+        return
+    places = np.unique([one.target_position for one in steps], axis=0) if steps else [flights.target_position]
+    for number, place in enumerate(places):
+        figure.add_trace(_mark(place, style.BOUND, "diamond", "target", "target", legend=number == 0))
 
 
 def _path(points: Float[np.ndarray, "M 3"], colour: str, width: float, name: str, group: str = "") -> go.Scatter3d:

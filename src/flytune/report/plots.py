@@ -24,20 +24,26 @@ UNITS = {"x": "m", "y": "m", "z": "m", "yaw": "deg"}
 
 
 def response(flights: Flights, judgement: Judgement, task: Task) -> go.Figure:
-    """x, y, z and yaw of the first trials against time, with a close-up of the last bands before the target."""
-    titles = ["whole flight", f"close-up: the target ± {BANDS_IN_CLOSE_UP} bands"]
+    """x, y, z and yaw of the first trials against time, with a close-up of the last bands before the target.
+
+    Of a target that moves, the close-up shows the error.
+    """
+    what = "the error within" if flights.moving else "the target ±"
+    titles = ["whole flight", f"close-up: {what} {BANDS_IN_CLOSE_UP} bands"]
     figure = style.panels(4, 2, titles, shared_xaxes="all", vertical_spacing=0.04, horizontal_spacing=0.09)
     for row, axis in enumerate(AXES, start=1):
         values, target, band = course(flights, axis)
-        for column in (1, 2):
+        whole, close = (values, target), (values - target, 0.0) if flights.moving else (values, target)
+        for column, (values, target) in enumerate((whole, close), start=1):
             for trial in range(min(TRIALS_SHOWN, flights.trials)):
                 line = _trial(flights, judgement, values, trial, legend=(row, column) == (1, 1))
                 dot = _settled_dot(flights, judgement, values, trial, axis)
                 figure.add_traces([line, dot], rows=row, cols=column)
-            target_and_band(figure, row, column, target, band)
+            target_and_band(figure, row, column, target, band, flights)
+        _, middle = close
         wide = BANDS_IN_CLOSE_UP * band
         figure.update_yaxes(title_text=f"{axis} [{UNITS[axis]}]", row=row, col=1)
-        figure.update_yaxes(range=[target - wide, target + wide], row=row, col=2)
+        figure.update_yaxes(range=[middle - wide, middle + wide], row=row, col=2)
     for end in task.termination.values():
         if isinstance(end, MinimumAltitude):
             _bound(figure, float(end.bound), row=AXES.index("z") + 1, column=1)
@@ -104,14 +110,22 @@ def quantiles(values: Float[np.ndarray, "N K"], *shares: float) -> list[Float[np
     return [np.where(np.isfinite(level), level, np.nan).astype(np.float32) for level in found]
 
 
-def course(flights: Flights, axis: str) -> tuple[Float[np.ndarray, "N K"], float, float]:
-    """Values [N, K], target and band of an axis in its unit; yaw without jumps, as the judge reads it."""
+def course(flights: Flights, axis: str) -> tuple[Float[np.ndarray, "N K"], Any, float]:
+    """Values [N, K], target and band of an axis in its unit; yaw without jumps, as the judge reads it.
+
+    The target is a number, or [K] of one that moves.
+    """
     if axis != "yaw":
         index = AXES.index(axis)
-        return flights.position[:, :, index], float(flights.target_position[index]), metrics.POSITION_BAND
+        target = flights.target_position[..., index]
+        return flights.position[:, :, index], target if flights.moving else float(target), metrics.POSITION_BAND
     with np.errstate(invalid="ignore"):
-        error = metrics.unwrapped_yaw_error(metrics.yaw_angle(flights.attitude), flights.target_yaw)
-    return np.degrees(error + flights.target_yaw), math.degrees(flights.target_yaw), math.degrees(metrics.YAW_BAND)
+        yaw, aim = metrics.yaw_angle(flights.attitude), flights.target_yaw
+        if flights.moving:
+            error = metrics.unwrapped_yaw_error(yaw - aim, 0.0)
+            return np.degrees(error + aim), np.degrees(aim), math.degrees(metrics.YAW_BAND)
+        error = metrics.unwrapped_yaw_error(yaw, aim)
+    return np.degrees(error + aim), math.degrees(aim), math.degrees(metrics.YAW_BAND)
 
 
 def _trial(
@@ -150,8 +164,14 @@ def _settled_dot(flights: Flights, judgement: Judgement, values: np.ndarray, tri
     )
 
 
-def target_and_band(figure: go.Figure, row: int, column: int, target: float, band: float) -> None:
-    """Draw the target and the settling band behind the curves of a panel."""
+def target_and_band(figure: go.Figure, row: int, column: int, target: Any, band: float, flights: Flights) -> None:
+    """Draw the target, a number or [K], and the settling band behind the curves of a panel."""
+    if np.ndim(target):
+        step = stride(flights)
+        line = {"color": style.QUIET, "width": 1, "dash": "dash"}
+        course = curve(flights, step, target[::step], line=line, name="target", showlegend=False, hoverinfo="skip")
+        figure.add_trace(course, row=row, col=column)
+        return
     # plotly's add_hrect and add_hline draw the same, thirty times slower
     wide = {"x0": 0, "x1": 1, "xref": "x domain", "layer": "below", **style.at(row, column)}
     figure.add_shape(type="rect", y0=target - band, y1=target + band, fillcolor=style.BAND, line={"width": 0}, **wide)

@@ -18,10 +18,12 @@ from flytune.evaluation.comparison_table import (
     sentences,
 )
 from flytune.evaluation.evaluate import Evaluation
+from flytune.evaluation.path_table import path_tables
 from flytune.evaluation.table import response_table
 from flytune.report import comparison_plots, envelope, plots, words
 from flytune.report.learning import ends_that_never_came, learning
 from flytune.report.page import write_page
+from flytune.report.path_plots import tracking
 from flytune.report.style import listed
 
 SAME_PLACE = 1e-4  # m; another simulator may round the start, which is metres away
@@ -73,7 +75,7 @@ def _check_same_trials(evaluations: Sequence[Evaluation], comparison: Comparison
         raise BadInput(
             f"compare: {len(evaluations)} controllers are not allowed. Allowed: {number}, one per judgement, in order."
         )
-    first, *others = (one.flights.position[:, 0] - one.flights.target_position for one in evaluations)
+    first, *others = (one.flights.start_error for one in evaluations)
     for name, start in zip(comparison.names[1:], others, strict=True):
         if not np.allclose(start, first, rtol=0, atol=SAME_PLACE, equal_nan=True):
             raise BadInput(
@@ -90,6 +92,8 @@ def _controller(evaluation: Evaluation) -> dict[str, Any]:
         "judgement": judgement,
         "summary": words.summary(judgement),
         "table": response_table(judgement.to_dict()),
+        "paths": path_tables([judgement.to_dict()]),
+        "tracking": tracking(flights, judgement) if judgement.tracking else None,
         "facts": words.facts(judgement, flights.speed_bound),
         "response": plots.response(flights, judgement, evaluation.task),
         "motion": plots.motion(flights, judgement),
@@ -108,6 +112,7 @@ def _comparison(evaluations: Sequence[Evaluation], comparison: Comparison | None
     judgements = [evaluation.judgement for evaluation in evaluations]
     shown = {
         "table": comparison_table(judgements),
+        "paths": path_tables([judgement.to_dict() for judgement in judgements]),
         "share": plots.settled_share(judgements),
         "tasks": words.task_differences(evaluations),
     }

@@ -74,7 +74,7 @@ def reset(family: TaskFamily, key: jax.Array) -> Episode:
 def observe(task: Task, episode: Episode, normal: Float[Array, "13"]) -> Float[Array, "17"]:
     """The noisy observation of an episode, for 13 standard normal numbers."""
     noise = task.noise.at_rate(task.vehicle.control_rate)
-    return observation.observe(task.target, noise, episode.state, episode.last_action, normal)
+    return observation.observe(task.reference(episode.steps), noise, episode.state, episode.last_action, normal)
 
 
 def see(family: TaskFamily, episode: Episode, normal: Float[Array, "13"]) -> Float[Array, "_"]:
@@ -95,13 +95,13 @@ def step(
 
 def assess(task: Task, episode: Episode, state: State, action: Float[Array, "4"]) -> tuple[Episode, Outcome]:
     """The episode in the state that a clipped action led to, and the result of the step, for any simulator."""
-    here = situation(task.target, state, per_unit_time(task.vehicle, action - episode.last_action))
+    steps = episode.steps + 1
+    here = situation(task.reference(steps), state, per_unit_time(task.vehicle, action - episode.last_action))
     terms = rewards(task.reward, here)
     if task.vehicle.control_rate != RATE:  # so that the same flight earns the same in the same time
         terms = {name: term * (RATE / task.vehicle.control_rate) for name, term in terms.items()}
     left = margins(task.termination, here)
     why = cause(left)
-    steps = episode.steps + 1
     terminated = why != SAFE
     outcome = Outcome(
         reward=sum(terms.values(), start=jnp.zeros(())),
@@ -154,24 +154,24 @@ def hold(
 
     Terminations end nothing here. The steps of a held episode are -1.
     """
-    crashed = (before.steps < 0) | is_crashed(family.member(moved.numbers), moved.state)
+    crashed = (before.steps < 0) | is_crashed(family.member(moved.numbers), moved.state, moved.steps)
     held = dataclasses.replace(before, steps=jnp.full_like(before.steps, -1))
     return jax.tree.map(lambda new, old: jnp.where(crashed, old, new), moved, held), crashed
 
 
-def is_crashed(task: Task, state: State) -> Bool[Array, ""]:
-    """Whether a vehicle has crashed: it left the ball around its target, or its state is not finite.
+def is_crashed(task: Task, state: State, steps: Any) -> Bool[Array, ""]:
+    """Whether a vehicle has crashed after some steps: it left the ball around its target, or is not finite.
 
     The ball has a radius of 10 m, and of twice the farthest start where that is more.
     """
-    distance = safe_norm(position_error(task.target, state.position))
+    distance = safe_norm(position_error(task.reference(steps), state.position))
     radius = jnp.maximum(CRASH_DISTANCE, 2 * task.initial_state.farthest())
     body = jnp.stack([*state.position, *state.attitude, *state.velocity, *state.body_rate])
     return ~((distance <= radius) & jnp.all(jnp.isfinite(body)))
 
 
 def margins_along(
-    task: Task, settings: Any, states: State, changes: Float[Array, "T 4"]
+    task: Task, settings: Any, states: State, changes: Float[Array, "T 4"], steps: Int[Array, "T"]
 ) -> dict[str, Float[Array, "T"]]:
     """The margins of each termination along one trial, first axis time.
 
@@ -180,10 +180,11 @@ def margins_along(
         settings: of the dials, each [T]; empty for a task without dials.
         states: the states [T, ...].
         changes: of the action before each state.
+        steps: the control steps from the start to each state.
     """
 
-    def one(numbers: Any, state: State, change: Array) -> dict[str, Array]:
+    def one(numbers: Any, state: State, change: Array, steps: Array) -> dict[str, Array]:
         here = task.member(numbers)
-        return margins(here.termination, situation(here.target, state, per_unit_time(here.vehicle, change)))
+        return margins(here.termination, situation(here.reference(steps), state, per_unit_time(here.vehicle, change)))
 
-    return jax.vmap(one)(settings, states, changes)
+    return jax.vmap(one)(settings, states, changes, steps)

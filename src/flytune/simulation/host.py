@@ -6,6 +6,7 @@ episodes and the report are one array of float32 each, which holds the whole num
 """
 
 import dataclasses
+import math
 from collections.abc import Callable
 from functools import partial
 from typing import Any
@@ -120,8 +121,7 @@ class HostEnvironment:
                 "load_task(...).at({'NAME': value})."
             )
         self.task, self.number, self.simulator = task, number, simulator
-        leaves, self._structure = jax.tree.flatten(task)
-        self._numbers = jnp.asarray(np.asarray(leaves, np.float32))
+        self._numbers, self._structure = _packed(task)
         self._ending = ending
         self._hover = float(hover_action(task.vehicle))
         self._terms = tuple(sorted(task.reward))
@@ -202,7 +202,7 @@ class HostEnvironment:
     def __setstate__(self, state: dict[str, Any]) -> None:
         """Go on with what `__getstate__` gave."""
         self.__dict__ |= state
-        self._structure = jax.tree.structure(self.task)
+        self._structure = _packed(self.task)[1]
         self.key = None if self.key is None else jax.random.wrap_key_data(jnp.asarray(self.key))
 
     def steps(self) -> np.ndarray:
@@ -242,13 +242,30 @@ def unravel(task: Task, numbers: Array) -> Episode:
     return jax.vmap(back, in_axes=-1, out_axes=-1)(numbers)
 
 
+def _packed(task: Task) -> tuple[Array, Any]:
+    """The numbers of a task as one array, and its structure with the shapes of its leaves."""
+    leaves, structure = jax.tree.flatten(task)
+    numbers = np.concatenate([np.ravel(leaf) for leaf in leaves]).astype(np.float32)
+    return jnp.asarray(numbers), (structure, tuple(np.shape(leaf) for leaf in leaves))
+
+
+def _unpacked(structure: Any, numbers: Array) -> Task:
+    """The task of an array of its numbers."""
+    form, shapes = structure
+    ends = np.cumsum([math.prod(shape) for shape in shapes]).tolist()
+    starts = [0, *ends[:-1]]
+    parts = zip(shapes, starts, ends, strict=True)
+    leaves = [numbers[start:end].reshape(shape) if shape else numbers[start] for shape, start, end in parts]
+    return jax.tree.unflatten(form, leaves)
+
+
 def _seen(task: Task, episodes: Episode, noise: Any) -> Float[Array, "17 N"]:
     return batched(environment.observe, task)(episodes, noise)
 
 
 @partial(jax.jit, static_argnums=(0, 1))
 def _draw(structure: Any, number: int, numbers: Array, key: Array) -> tuple[Array, Array, Array]:
-    task = jax.tree.unflatten(structure, list(numbers))
+    task = _unpacked(structure, numbers)
     key, start_key, noise_key = jax.random.split(key, 3)
     episodes = reset_all(task, jax.random.split(start_key, number))
     seen = _seen(task, episodes, jax.random.normal(noise_key, (NOISY, number)))
@@ -257,14 +274,14 @@ def _draw(structure: Any, number: int, numbers: Array, key: Array) -> tuple[Arra
 
 @partial(jax.jit, static_argnums=0)
 def _look(structure: Any, numbers: Array, episodes: Array, noise: Any) -> Array:
-    task = jax.tree.unflatten(structure, list(numbers))
+    task = _unpacked(structure, numbers)
     begun = unravel(task, episodes)
     return jnp.concatenate([_seen(task, begun, noise), state_numbers(begun.state)])
 
 
 @partial(jax.jit, static_argnums=0)
 def _steps(structure: Any, numbers: Array, episodes: Array) -> Array:
-    return unravel(jax.tree.unflatten(structure, list(numbers)), episodes).steps
+    return unravel(_unpacked(structure, numbers), episodes).steps
 
 
 @partial(jax.jit, static_argnums=(0, 1, 2))
@@ -280,7 +297,7 @@ def _step(
     reached: Array | None,
 ) -> tuple[Array | None, Array, Array]:
     """The key, the episodes after a step, and the report of a `Transition`."""
-    task, number = jax.tree.unflatten(structure, list(numbers)), action.shape[0]
+    task, number = _unpacked(structure, numbers), action.shape[0]
     before, keys = unravel(task, episodes), None
     if key is not None:
         key, noise_key, start_key = jax.random.split(key, 3)
@@ -300,7 +317,7 @@ def _step(
     final = _seen(task, moved, noise) if ending == "restart" else seen
     states = placed = state_numbers(after.state)
     if ending == "hold":  # where the simulator has no trouble with a crashed vehicle
-        at_target = state_numbers(hovering(task.vehicle, task.target.position))
+        at_target = state_numbers(hovering(task.vehicle, task.reference(0).position))
         placed = jnp.broadcast_to(at_target[:, None], states.shape)
     results = [outcome.reward, outcome.cause, outcome.truncated, moved.reward, moved.steps, over]
     results += [outcome.terms[name] for name in sorted(outcome.terms)]

@@ -93,7 +93,7 @@ def _starts(task: Task, initial_state: InitialState, slack: Any, rate_limit: Any
         state = initial_state.draw(task.vehicle, task.target, key)
         gained = _speed_gained(task.vehicle, state.attitude, rate_limit)
         state = dataclasses.replace(state, velocity=(gained, jnp.zeros(()), jnp.zeros(())))
-        here = situation(task.target, state, jnp.zeros(4))
+        here = situation(task.reference(0), state, jnp.zeros(4))
         ends = task.termination.items()
         return (
             {name: end.measure(here) for name, end in ends},

@@ -14,7 +14,8 @@ from flytune.physics.components import Components
 from flytune.physics.dynamics import State, hovering
 from flytune.physics.rotation import safe_norm
 from flytune.physics.vehicle import Vehicle
-from flytune.task.situation import Metres, Target
+from flytune.task.paths import Metres
+from flytune.task.target import Target
 
 
 @pytree
@@ -23,6 +24,7 @@ class InitialState:
 
     The box is relative to the target: it is written for a target at `for_target` and moves with the task's own, but no
     start lies below `lowest_altitude`. The heading is relative to that of the target; the box does not turn with it.
+    Of a target that moves, place and heading at the start count.
     """
 
     lowest_position: tuple[Metres, Metres, Metres]  # corner of the box for a target at for_target
@@ -68,7 +70,7 @@ class InitialState:
         above = self.lowest_altitude + (top - self.lowest_altitude) * unit[2]
         position = x, y, jnp.where(bottom < self.lowest_altitude, above, z)
         roll, pitch = (self.largest_tilt * (2 * share - 1) for share in unit[3:5])
-        yaw = target.yaw + self.largest_yaw * (2 * unit[5] - 1)
+        yaw = target.first_yaw + self.largest_yaw * (2 * unit[5] - 1)
         return hovering(vehicle, position, rotation.from_euler(roll, pitch, yaw))
 
 

@@ -14,7 +14,14 @@ from flytune.config.pytree import pytree
 from flytune.physics import rotation
 from flytune.physics.components import add, pack, scale, unpack
 from flytune.physics.dynamics import State
-from flytune.task.situation import Target, attitude_error, in_heading_frame, position_error
+from flytune.task.reference import Reference
+from flytune.task.situation import (
+    attitude_error,
+    body_rate_error,
+    in_heading_frame,
+    position_error,
+    velocity_error,
+)
 
 SIZE = 17
 BLOCK_NAMES = ("position_error", "attitude_error", "velocity", "body_rate", "last_action")
@@ -51,7 +58,7 @@ class ObservationNoise:
 
 
 def observe(
-    target: Target,
+    target: Reference,
     noise: ObservationNoise,
     state: State,
     last_action: Float[Array, "4"],
@@ -60,10 +67,11 @@ def observe(
     """What the controller sees of a true state: [e_p, q_e, v, w, a_{t-1}].
 
     Position error and velocity are seen in the heading frame, whose x axis points where the target looks. So a
-    controller does the same for every yaw of the target.
+    controller does the same for every yaw of the target. Of a target that moves, velocity, attitude and body rate are
+    relative to those of the target: a controller that hovers then follows it.
 
     Args:
-        target: where to hover.
+        target: where to be at this instant, and how it moves.
         noise: standard deviations.
         state: the true state.
         last_action: the action before, in [-1, 1].
@@ -74,8 +82,11 @@ def observe(
     numbers = unpack(normal)
     position = add(in_heading_frame(target, position_error(target, state.position)), scale(noise.position, numbers[:3]))
     attitude = rotation.normalise(add(attitude_error(target, state.attitude), scale(noise.attitude, numbers[3:7])))
-    velocity = add(in_heading_frame(target, state.velocity), scale(noise.velocity, numbers[7:10]))
-    body_rate = add(state.body_rate, scale(noise.body_rate, numbers[10:]))
+    velocity = add(
+        in_heading_frame(target, velocity_error(target, state.velocity)), scale(noise.velocity, numbers[7:10])
+    )
+    turning = body_rate_error(target, state.attitude, state.body_rate)
+    body_rate = add(turning, scale(noise.body_rate, numbers[10:]))
     return pack((*position, *attitude, *velocity, *body_rate, *unpack(last_action)))
 
 

@@ -20,7 +20,7 @@ Error = Literal["horizontal", "vertical", "position", "velocity", "attitude", "b
 
 
 def squared_error(situation: Situation, of: Error) -> Float[Array, ""]:
-    """The square of the error a term looks at: m^2, (m/s)^2, rad^2 or (rad/s)^2.
+    """The square of the error a term looks at, from the target and its motion: m^2, (m/s)^2, rad^2 or (rad/s)^2.
 
     The exponentials need squares, and a square root has no gradient at the target.
     """
@@ -32,11 +32,11 @@ def squared_error(situation: Situation, of: Error) -> Float[Array, ""]:
         case "position":
             return squared_norm(situation.position_error)
         case "velocity":
-            return squared_norm(situation.velocity)
+            return squared_norm(situation.velocity_error)
         case "attitude":
             return rotation.angle(situation.attitude_error) ** 2
         case "body_rate":
-            return squared_norm(situation.body_rate)
+            return squared_norm(situation.body_rate_error)
 
 
 @pytree

@@ -14,13 +14,16 @@ from flytune.config.document import Real, Whole
 from flytune.config.formula import Formula
 from flytune.config.pytree import label, pytree, with_field
 from flytune.errors import BadInput
+from flytune.physics.dynamics import CONTROL_PERIOD
 from flytune.physics.vehicle import Vehicle
 from flytune.task.dial import Dial, Input, Setting, checked_setting, number_of_inputs, told
 from flytune.task.following import problem_of_dials, tables_at, words
 from flytune.task.initial_state import InitialState
 from flytune.task.observation import SIZE, ObservationNoise
+from flytune.task.path_check import problem_of_path
+from flytune.task.reference import Reference
 from flytune.task.reward import RewardTerm
-from flytune.task.situation import Target
+from flytune.task.target import Point, Target
 from flytune.task.termination import Termination
 from flytune.task.training_settings import ApgSettings, PpoSettings
 
@@ -68,6 +71,12 @@ class Task:
     def inputs(self) -> int:
         """How many numbers a controller of this task is given: 17, and those of its dials."""
         return SIZE + number_of_inputs(self.input)
+
+    def reference(self, steps: Any) -> Reference:
+        """Where the target is after some control steps, and how it moves; a fixed one is the same at any time."""
+        if isinstance(self.target, Point):
+            return self.target.reference()
+        return self.target.reference(jnp.maximum(steps, 0) * self.vehicle.control_period, self.vehicle.gravity)
 
     def draw(self, key: jax.Array) -> tuple[Any, jax.Array]:
         """The settings of the dials of one episode; without a dial nothing, and the key itself. See `TaskFamily`."""
@@ -125,7 +134,13 @@ class Task:
             return "reward: no term. Allowed: one or more tables [reward.NAME]."
         if not re.fullmatch(r"[\w .+-]{1,100}", self.name):
             return f"name: {self.name[:100]!r} cannot name a run. Allowed: up to 100 letters, digits and . _ + - signs."
-        return problem_of_dials(self.dial, self.follow, self.input)
+        flown = max(float(self.duration), float(self.horizon) * CONTROL_PERIOD)
+        return problem_of_dials(self.dial, self.follow, self.input) or self.problem_of_path(flown)
+
+    def problem_of_path(self, duration: float) -> str | None:
+        """What of the target's path cannot be flown for a duration in s within the bounds, or None."""
+        vehicle = self.vehicle
+        return problem_of_path(self.target, self.termination, vehicle.gravity, vehicle.thrust_to_weight, duration)
 
 
 @runtime_checkable

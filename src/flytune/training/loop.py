@@ -14,7 +14,7 @@ from typing import Any
 import jax
 
 from flytune.config.files import held, make_folder
-from flytune.control.policy import Policy
+from flytune.control.policy import Policy, facts_of_vehicle
 from flytune.errors import BadInput, Interrupted, require
 from flytune.runs.directory import RunDirectory, resume_command
 from flytune.task.files import write_task
@@ -125,7 +125,7 @@ def train(
 
     about = {  # the facts in the header of a policy file
         "task": task.name,
-        "vehicle": task.vehicle.name,
+        **facts_of_vehicle(task.vehicle),
         "task_toml": write_task(task),
         "trainer": trainer,
         "seed": seed,

@@ -55,6 +55,12 @@ def find_start(requirement: Requirement, wanted: str | None, edits: Mapping[str,
     Raises:
         BadInput: no such task, a bad edit, or a requirement that no controller can meet.
     """
+    kind = load_task(wanted, dict(edits)).target.kind if wanted else _kind(edits)
+    if kind != "point":
+        raise BadInput(
+            f"target.kind: {kind} is not allowed in a tuning, since a target that moves has no settling time. Allowed: "
+            "point. Tune the response to a point; the controller then follows paths as well."
+        )
     if wanted and load_task(wanted, dict(edits)).dial:
         if wanted != DIAL:
             raise BadInput(
@@ -123,6 +129,12 @@ def _other_fields(trained: Task, wanted: Task) -> list[str]:
     parts = ["vehicle", *(key for key in one if key not in (*OF_TRAINING, "vehicle"))]
     differences = (nested.first_difference({part: one[part]}, {part: other[part]}) for part in parts)
     return [path for path in differences if path]
+
+
+def _kind(edits: Mapping[str, Any]) -> str:
+    """The kind of target that the edits of a known task give it."""
+    table = edits.get("target")
+    return edits.get("target.kind", table.get("kind", "point") if isinstance(table, Mapping) else "point")
 
 
 def _time(response: ResponseSummary) -> float:
