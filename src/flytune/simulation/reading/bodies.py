@@ -1,6 +1,7 @@
 """Rigid bodies of a model: where they are, and their mass and inertia as one body."""
 
 import dataclasses
+import math
 from collections.abc import Mapping, Sequence
 
 import numpy as np
@@ -53,7 +54,7 @@ def combined(bodies: Sequence[Body]) -> tuple[float, Vector, Matrix]:
 
     J = sum R_i J_i R_i^T + m_i (|d_i|^2 I - d_i d_i^T), with d_i from the common centre of mass (Steiner).
     """
-    mass = sum(body.mass for body in bodies)
+    mass = math.fsum(body.mass for body in bodies)
     centre = sum((body.mass * body.frame.position for body in bodies), np.zeros(3)) / mass
     total = np.zeros((3, 3))
     for body in bodies:
