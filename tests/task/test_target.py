@@ -237,7 +237,7 @@ def test_a_csv_lies_beside_its_task_file_and_the_task_holds_its_numbers(tmp_path
     (tmp_path / "path.csv").write_text("T, X ,y,z,yaw\n" + "\n".join(rows))
     (tmp_path / "task.toml").write_text('based_on = "baseline"\n[target]\nkind = "csv"\nfile = "path.csv"\n'
                                         'interpolation = "smooth"\nends = "at_rest"\n')  # fmt: skip
-    with pytest.raises(BadInput, match="row 2: yaw: 170 .* in deg"):
+    with pytest.raises(BadInput, match=r"row 2: yaw: 170 .* in deg"):
         load_task(tmp_path / "task.toml")
     text = (tmp_path / "path.csv").read_text().replace(",170", ",3.1").replace(",-170", ",-3.1")
     (tmp_path / "path.csv").write_text(text)

@@ -191,8 +191,8 @@ def _read(file: File, where: str) -> dict[str, Any]:
     if "yaw" in columns and (large := np.abs(numbers[:, 4]) > LARGEST_YAW).any():
         line = int(np.argmax(large))
         raise BadInput(
-            f"{where}: row {line + 2}: yaw: {numbers[line, 4]:g} is not allowed. Allowed: -{LARGEST_YAW} to {LARGEST_YAW} "
-            f"rad. Is it in deg? Then write {math.radians(numbers[line, 4]):.4g}."
+            f"{where}: row {line + 2}: yaw: {numbers[line, 4]:g} is not allowed. Allowed: -{LARGEST_YAW} to "
+            f"{LARGEST_YAW} rad. Is it in deg? Then write {math.radians(numbers[line, 4]):.4g}."
         )
     found = {"times": (time - time[0]).round(9).tolist(), "positions": numbers[:, 1:4].tolist()}
     return found | ({"yaws": np.unwrap(numbers[:, 4]).tolist()} if "yaw" in columns else {})
