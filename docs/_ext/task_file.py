@@ -88,6 +88,8 @@ def rows(kind: type) -> Iterator[str]:
     for each in reversed(kind.__mro__):  # a field may come from a class above
         notes |= comments(each) if dataclasses.is_dataclass(each) else {}
     for field in dataclasses.fields(kind):
+        if field.metadata.get("derived"):
+            continue
         annotation = hints[field.name]
         base, _ = plain(annotation)
         if get_origin(base) is dict and plain(get_args(base)[1])[0] is Formula:
@@ -96,7 +98,8 @@ def rows(kind: type) -> Iterator[str]:
             continue
         if field.name == "kind":
             values = f"`{get_args(base)[0]}`" if get_origin(base) is Literal else ""
-            yield f"| `kind` | | {values} | required | names the class |"
+            given = '`"point"`' if values == "`point`" else "required"
+            yield f"| `kind` | | {values} | {given} | names the class |"
             continue
         cells = (
             cell(unit(annotation)),
@@ -130,8 +133,11 @@ def tables(kind: type, path: str, level: int) -> Iterator[str]:
                 kinds = f', kind `"{get_args(plain(hint)[0])[0]}"`' if hint else ""
                 yield from tables(variant, f"`[{name}.NAME]`{kinds}", level + 1)
         else:
-            for variant in variants(hints[field.name]):
-                yield from tables(variant, f"`[{name}]`", level + 1)
+            found = variants(hints[field.name])
+            for variant in found:
+                hint = get_type_hints(variant, include_extras=True).get("kind")
+                kinds = f', kind `"{get_args(plain(hint)[0])[0]}"`' if hint and len(found) > 1 else ""
+                yield from tables(variant, f"`[{name}]`{kinds}", level + 1)
 
 
 class TaskFile(SphinxDirective):

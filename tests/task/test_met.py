@@ -34,7 +34,7 @@ class Hover:
 def trained(tmp_path_factory):
     """A run of few updates."""
     folder = tmp_path_factory.mktemp("met") / "run"
-    flytune.train(load_task("baseline", {"apg.updates": 2, "apg.environments": 2}), out=folder)
+    flytune.train(load_task("baseline", {"apg.updates": 2, "apg.environments": 4}), out=folder)
     return folder
 
 
@@ -87,7 +87,7 @@ def test_noise_is_met_likewise():
         ({"reward.position.weight": 1.0}, "set: reward.position.weight is not what a controller meets in flight. "),
         ({"vehicle.action_scale": 0.4}, "set: vehicle.action_scale says what an action of the controller means"),
         ({"vehicle.control_rate": 50}, "set: vehicle.control_rate says what an action"),
-        ({"vehicle.mas": 0.04}, "vehicle.mas: unknown key"),
+        ({"vehicle.mas": 0.04}, "vehicle.mas: no such field. Did you mean vehicle.mass"),
         ({"vehicle.mass": -1.0}, "vehicle.mass: -1.0 is not allowed"),
         ({"vehicle.mass": 0.09}, "vehicle.maximum_rotor_speed_rpm: "),
     ],

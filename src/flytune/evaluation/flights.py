@@ -110,7 +110,7 @@ class Flights(Labels):
         return dataclasses.replace(
             self,
             **fields,
-            time=self.time[part] - self.time[part.start],
+            time=np.round(self.time[part] - self.time[part.start], 9),
             crashed=crashed,
             margins={name: margin[:, part] for name, margin in self.margins.items()},
             target_position=self.target_position[part.start],

@@ -109,10 +109,14 @@ def joined(flights: Sequence[Flights], name: str, on_message: Callable[[str], No
     stacked = {field: np.concatenate([getattr(one, field)[:, :samples] for one in flights]) for field in COLUMNS}
     stacked |= {field: np.full_like(stacked[field], np.nan) for field in missing}
     crashed = np.concatenate([one.crashed for one in flights])
+    common = [name for name in first.margins if all(name in other.margins for other in others)]
+    margins = {name: np.concatenate([one.margins[name][:, :samples] for one in flights]) for name in common}
     time = first.time[:samples]
     if first.moving:
         stacked |= {"target_position": target[:, :3], "target_yaw": target[:, 3]}
-    return dataclasses.replace(first, **stacked, time=time, crashed=crashed, missing=missing, name=name)
+    return dataclasses.replace(
+        first, **stacked, margins=margins, time=time, crashed=crashed, missing=missing, name=name
+    )
 
 
 def _target(flights: Flights, samples: int) -> np.ndarray:

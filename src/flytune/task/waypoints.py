@@ -22,6 +22,7 @@ from flytune.task.reference import Path, Reference
 MOST = 10_000  # waypoints; a task and a policy's file hold them all
 SHORTEST_STEP = 0.5  # s; nothing settles sooner, since it has to stay in the band for so long
 LARGEST_GAP = 10  # in a file, times the median time from row to row
+LARGEST_YAW = 30  # rad, in a file; a larger one is probably in degrees
 COLUMNS = ("t", "x", "y", "z", "yaw")
 
 
@@ -186,6 +187,12 @@ def _read(file: File, where: str) -> dict[str, Any]:
             f"{where}: row {line + 3}: no sample for {steps[line]:.3g} s, where rows are {np.median(steps):.3g} s "
             f"apart. Allowed: up to {LARGEST_GAP} times that. Fill the gap, or write kind = "
             '"waypoints" with times and positions.'
+        )
+    if "yaw" in columns and (large := np.abs(numbers[:, 4]) > LARGEST_YAW).any():
+        line = int(np.argmax(large))
+        raise BadInput(
+            f"{where}: row {line + 2}: yaw: {numbers[line, 4]:g} is not allowed. Allowed: -{LARGEST_YAW} to "
+            f"{LARGEST_YAW} rad. Is it in deg? Then write {math.radians(numbers[line, 4]):.4g}."
         )
     found = {"times": (time - time[0]).round(9).tolist(), "positions": numbers[:, 1:4].tolist()}
     return found | ({"yaws": np.unwrap(numbers[:, 4]).tolist()} if "yaw" in columns else {})
