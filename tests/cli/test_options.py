@@ -173,9 +173,9 @@ REFUSED = {
     "judge f.csv --target 0 0 1 0": "--target: 4 values are not allowed. Allowed: one, X,Y,Z,YAW. Write --target "
     "0,0,1,0.",
     "judge f.csv --target -1 0": "--target: 2 values are not allowed. Allowed: one, X,Y,Z,YAW. See",
-    "evaluate pid --set target.yaw=1": "--set: is no option of evaluate. Edits of a task belong to train, tune and "
-    "show. To fly an edited task: flytune show TASK --set PATH=VALUE > FILE.toml, then --task FILE.toml.",
-    "compare pid lqr --sets x=1": "--sets: is no option of compare. Edits of a task belong",
+    "evaluate pid --set target.yaw=1": "set: target.yaw is not what a controller meets in flight. Allowed: fields of "
+    "vehicle, noise.",
+    "compare pid lqr --sets x=1": "--sets: there is no such option. Did you mean --set?",
     "map dial --set x=1": "--set: is no option of map. Edits of a task belong to train, tune and show. See",
 }
 

@@ -121,9 +121,19 @@ class FlightOptions:
         ),
     ] = ()
 
+    changes: Annotated[
+        Assignments,
+        Parameter(
+            name="--set",
+            help="what the controller meets in place of what it was told, of the vehicle or the noise: "
+            "vehicle.mass=0.036 ...",
+        ),
+        completed_by(edits),
+    ] = ()
+
     def settings(self) -> dict[str, Any]:
         """The keyword arguments of `flytune.evaluate`."""
-        read = {name: assignments(getattr(self, name)) for name in ("simulator_options", "dial")}
+        read = {name: assignments(getattr(self, name)) for name in ("simulator_options", "dial", "changes")}
         return vars(self) | read
 
 

@@ -8,7 +8,6 @@ from cyclopts import App, CoercionError, CycloptsError, MissingArgumentError, Un
 from cyclopts.exceptions import ConsumeMultipleError, UnknownCommandError
 
 _NO_EDITS = "is no option of {}. Edits of a task belong to train, tune and show."
-_TO_FLY = " To fly an edited task: flytune show TASK --set PATH=VALUE > FILE.toml, then --task FILE.toml."
 
 
 def refusal(error: CycloptsError) -> str:
@@ -30,9 +29,7 @@ def _problem(error: CycloptsError) -> str:
             typed = (error.token.keyword or error.token.value).partition("=")[0]
             names = [name for argument in error.argument_collection for name in argument.names if name[0] == "-"]
             if "--set" not in names and _nearest(typed, [*names, "--set"]) == "--set":
-                return (
-                    f"{typed}: {_NO_EDITS.format(' '.join(error.command_chain or ()))}{_TO_FLY * ('--task' in names)}"
-                )
+                return f"{typed}: {_NO_EDITS.format(' '.join(error.command_chain or ()))}"
             return f"{typed}: there is no such option.{_hint(typed, [*names, '--help'])}"
         case CoercionError():
             typed = error.token.value if error.token is not None else ""

@@ -115,6 +115,9 @@ def conditions(comparison: "Comparison") -> str:
         same = len(set(flown.values())) == 1
         values = flown[first.name] if same else ", ".join(f"{value} ({name})" for name, value in flown.items())
         text.append(f"{LABELS.get(field, field)} {values}")
+    if first.changes:
+        met = ", ".join(f"{path}={value}" for path, value in first.changes.items())
+        text.append(f"every controller meets {met}, and was told otherwise")
     for judgement in judgements:
         if judgement.made_for:
             text.append(

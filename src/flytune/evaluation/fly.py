@@ -26,6 +26,7 @@ from flytune.simulation.rollout import Draw, rollout
 from flytune.simulation.simulator import WIDTHS, Simulator, VehicleStates, state_from, state_numbers
 from flytune.simulation.simulators import make_simulator
 from flytune.task.initial_state import EVALUATION_INITIAL_STATES, InitialState
+from flytune.task.met import as_met
 from flytune.task.observation import SIZE, draw_noise
 from flytune.task.target import sampled
 from flytune.task.task import Task
@@ -43,6 +44,7 @@ def fly(
     initial_conditions: InitialConditions | InitialState = "clear",
     duration: float | None = None,
     name: str = "",
+    changes: Mapping[str, Any] | None = None,
     simulator: str | Callable[[Vehicle, int], Simulator] = "flytune",
     simulator_options: Mapping[str, Any] | None = None,
 ) -> Flights:
@@ -59,6 +61,8 @@ def fly(
         initial_conditions: `clear` (z0 >= 0.1 m), `paper` (exactly as printed), or a distribution of your own.
         duration: of a trial in s, more than 0.5; the task's own where None.
         name: the controller's name in the flights.
+        changes: field path -> its true value, of the vehicle or the noise, where the controller meets something else
+            than `task`, which is what it was told; see `task.met`.
         simulator: one of `flytune`, `pybullet`, `mujoco`; or a function that makes another one, from a vehicle and the
             number of trials.
         simulator_options: of that simulator, see `make_simulator`.
@@ -67,7 +71,7 @@ def fly(
         BadInput: an argument out of range, or a simulator that is not installed.
         Diverged: the controller answered a finite observation with an action that is not finite.
     """
-    made_for = ""
+    made_for, changes = "", dict(changes or {})
     if isinstance(controller, FoundController):
         controller, name, made_for = controller.controller, name or controller.name, controller.made_for(task)
     family, task = task, task.at({name: values[0] for name, values in settings_along(controller, task, 1).items()})
@@ -84,7 +88,7 @@ def fly(
         raise BadInput(f"starts {starts_name}: {problem}")
     if problem := task.problem_of_path(duration):
         raise BadInput(problem)
-    task = dataclasses.replace(task, initial_state=initial_state)
+    task = as_met(dataclasses.replace(task, initial_state=initial_state), changes)
     starts, noise_keys = _begin(task, trial_keys(seed, trials))
     simulator_name, made = _made(simulator, task.vehicle, trials, simulator_options)
     try:
@@ -113,6 +117,7 @@ def fly(
         initial_conditions=starts_name,
         dial=shown_setting(controller),
         made_for=made_for,
+        changes=changes,
     )
 
 

@@ -49,6 +49,7 @@ def response_text(judged: Mapping[str, Any]) -> str:
     """One judgement for a terminal: its conditions, the response table, and what does not belong to one channel."""
     dial = "".join(f", dial {name} {_shown(value)}" for name, value in (judged.get("dial") or {}).items())
     made_for = f", made for {judged['made_for']}" if judged.get("made_for") else ""
+    made_for += met_words(judged.get("set") or {})
     heading = (
         f"{judged['who']} on {judged['task']} ({judged['vehicle']}{made_for}, world {judged['world']}{dial}): "
         f"{judged['trials']} trials of {judged['duration']:g} s, starts {judged['starts']}, seed {judged['seed']}"
@@ -70,6 +71,11 @@ def response_text(judged: Mapping[str, Any]) -> str:
         footer.append(f"steps too small for overshoot and rise: {told}")
     tables = [response_table(judged), *path_tables([judged])]
     return "\n".join([heading, "", *(f"{table.text()}\n" for table in tables), *footer])
+
+
+def met_words(changes: Mapping[str, Any]) -> str:
+    """What a controller met in place of what it was told, for a heading."""
+    return "".join(f", met {path}={value}" for path, value in changes.items())
 
 
 def _shown(setting: Any) -> str:

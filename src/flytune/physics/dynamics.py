@@ -9,7 +9,7 @@ from flytune.config.pytree import pytree
 from flytune.physics import rotation
 from flytune.physics.components import Components, add, cross, scale, unpack
 from flytune.physics.rotors import commanded_rotor_speed, hover_action, thrust_and_torque
-from flytune.physics.vehicle import Vehicle
+from flytune.physics.vehicle import TrueVehicle, Vehicle
 
 CONTROL_PERIOD = 0.01  # s; the paper's (R6), and the longest physics step
 RAD_PER_S = 2 * math.pi / 60  # of one rpm
@@ -37,13 +37,16 @@ def least_physics_steps(vehicle: Vehicle) -> int:
 
 
 def hovering(vehicle: Vehicle, position: Components, attitude: Components = (0.0, 0.0, 0.0, 1.0)) -> State:
-    """The vehicle at rest with its rotors at hover speed."""
+    """The vehicle at rest with its rotors at hover speed, or at that which its controller was told."""
+    speed = vehicle.hover_rotor_speed_rpm
+    if isinstance(vehicle, TrueVehicle):
+        speed = commanded_rotor_speed(vehicle, hover_action(vehicle))
     return State(
         position=tuple(jnp.asarray(part, float) for part in position),
         attitude=tuple(jnp.asarray(part, float) for part in attitude),
         velocity=tuple(jnp.zeros(3)),
         body_rate=tuple(jnp.zeros(3)),
-        rotor_speed_rpm=tuple(jnp.full(4, vehicle.hover_rotor_speed_rpm, float)),
+        rotor_speed_rpm=tuple(jnp.full(4, speed, float)),
         pending_actions=no_pending_actions(vehicle),
     )
 

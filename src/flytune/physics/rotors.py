@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 from flytune.physics.components import Components
-from flytune.physics.vehicle import Vehicle
+from flytune.physics.vehicle import TrueVehicle, Vehicle
 
 # the x configuration (paper R4): side of each rotor on the x and y axes, and the sign of its torque about z
 X_SIDES = ((1, -1), (-1, -1), (-1, 1), (1, 1))
@@ -118,6 +118,8 @@ def commanded_rotor_speed(vehicle: Vehicle, action: Any, numpy: Any = jnp) -> An
         numpy: jax.numpy, or numpy for float64 outside of compiled code.
     """
     least, largest = vehicle.minimum_rotor_speed_rpm, vehicle.top_rotor_speed_rpm
+    if isinstance(vehicle, TrueVehicle):
+        return numpy.clip(commanded_rotor_speed(vehicle.nominal, action, numpy), least, largest)
     action = numpy.clip(action, -1.0, 1.0)
     if vehicle.action_scale is not None:
         return numpy.clip(vehicle.hover_rotor_speed_rpm * (1 + vehicle.action_scale * action), least, largest)
@@ -139,7 +141,12 @@ def action_of_rotor_speed(vehicle: Vehicle, rotor_speed_rpm: Any) -> Any:
 
 
 def hover_action(vehicle: Vehicle) -> Any:
-    """The action of each motor that hovers: 0 with the convention hover_relative."""
+    """The action of each motor that hovers: 0 with the convention hover_relative.
+
+    Of a `TrueVehicle` it is the one that would hover as its controller was told.
+    """
+    if isinstance(vehicle, TrueVehicle):
+        return hover_action(vehicle.nominal)
     return 0.0 if vehicle.action_scale is not None else action_of_rotor_speed(vehicle, vehicle.hover_rotor_speed_rpm)
 
 

@@ -250,6 +250,16 @@ class Vehicle:
         return None
 
 
+@pytree
+class TrueVehicle(Vehicle):
+    """A vehicle that differs from the one that its controller was made for.
+
+    An action asks for the rotor speed that it would mean on `nominal`.
+    """
+
+    nominal: Vehicle
+
+
 def inertia_matrix(vehicle: Vehicle) -> np.ndarray:
     """The matrix of inertia [3, 3] about the centre of mass in kg m^2, of a vehicle with plain numbers."""
     matrix = np.diag([float(each) for each in vehicle.inertia])

@@ -15,7 +15,7 @@ class Actuator:
 
     def __init__(self, vehicle: Vehicle, number: int) -> None:
         self._vehicle = vehicle
-        hover = float(vehicle.hover_rotor_speed_rpm)
+        hover = float(commanded_rotor_speed(vehicle, hover_action(vehicle), np))
         self.rotor_speed_rpm: Float[np.ndarray, "N 4"] = np.full((number, 4), hover)
         self._commanded = np.full((number, 4), hover)
         self._hover = float(hover_action(vehicle))

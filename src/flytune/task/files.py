@@ -2,6 +2,7 @@
 
 import dataclasses
 import os
+from collections.abc import Mapping
 from importlib import resources
 from pathlib import Path
 from typing import Any, TypeGuard
@@ -77,7 +78,16 @@ def load_task(task: str | Path, edits: dict[str, Any] | None = None) -> Task:
     check_given(task_read.follow, document.plain(task_read), given, where)
     if not edits:
         return task_read
-    complete = document.plain(task_read)
+    return edited_task(task_read, edits)
+
+
+def edited_task(task: Task, edits: Mapping[str, Any]) -> Task:
+    """A task with edits applied, as in `load_task`.
+
+    Raises:
+        BadInput: a field or a value that is not allowed.
+    """
+    complete = document.plain(task)
     for path, value in sorted(edits.items(), key=lambda edit: edit[0].count(".")):  # a table before what is in it
         complete = _edited(complete, path, value)
     return _read(complete)
