@@ -21,8 +21,8 @@ from flytune.simulation.simulators import SIMULATORS
 from flytune.task.files import load_task, preset_names
 
 COMMANDS = (
-    "train", "evaluate", "compare", "report", "map", "tune", "rules", "reproduce", "export", "list", "show", "bench",
-    "judge", "completion",
+    "train", "evaluate", "compare", "report", "map", "tune", "rules", "reproduce", "export", "list", "show", "vehicle",
+    "bench", "judge", "completion",
 )  # fmt: skip
 
 
@@ -119,12 +119,14 @@ COMPLETED = {  # words as bash splits them, the last one being typed
     "evaluate runs/": {"runs/mine"},
     "train my": {"mytask.toml"},
     "show ru": {"runs/"},
+    "vehicle x": {"x500"},
+    "vehicle my": {"mytask.toml"},
     "judge lo": {"log.csv"},
     "judge log.csv --columns t ti": {"time="},
     "report pid --out lo": {"log.csv"},
     "train baseline --set vehicle = crazyflie-m": {"crazyflie-measured"},
     "tune --settling-time 3 --set horizon = 3 vehicle = my": {"mytask.toml"},
-    "show baseline --set target": {"target.position=", "target.yaw="},
+    "show baseline --set target": {"target.kind=", "target.position=", "target.yaw="},
     "completion z": {"zsh"},
     "evaluate nobody": set(),
 }

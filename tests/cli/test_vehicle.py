@@ -76,6 +76,11 @@ def test_what_the_file_lacks_is_named_with_how_to_measure_it_and_training_says_t
     assert load_vehicle("mine.toml").motor_fall_time_constant == 0.03
 
 
+def test_a_model_where_a_vehicle_is_wanted_is_led_to_this_command(here, capsys):
+    line = refused("train", "baseline", "--set", "vehicle=gazebo.sdf", capsys=capsys)
+    assert "Make a vehicle of it: flytune vehicle gazebo.sdf --out mine.toml" in line
+
+
 def test_a_file_that_flytune_did_not_write_is_not_replaced(here, capsys):
     (here / "notes.toml").write_text("mine = true\n")
     assert "notes.toml is there and is not a vehicle file" in refused(
@@ -107,7 +112,7 @@ def test_nothing_is_written_of_a_file_that_is_refused(here, capsys):
         (["crazyfly"], "'crazyfly' is no vehicle. Allowed: crazyflie, "),
         (["none.toml"], "none.toml: cannot be read"),
         (["model.usd"], "vehicle: model.usd is not allowed. Allowed: a file .toml, .urdf, .sdf or .xml, or a name."),
-        (["gazebo.sdf", "--set"], "--set: there is no such option"),
+        (["gazebo.sdf", "--set"], "--set: is no option of vehicle"),
     ],
 )
 def test_wrong_arguments_are_refused_in_one_line(here, capsys, arguments, line):

@@ -52,7 +52,7 @@ _flytune() {
 complete -o default -F _flytune flytune
 """
 CLASSICAL = ("pid", "geometric", "lqr")
-MODELS, TASK_FILES = (".safetensors", ".onnx", ".zip"), (".toml",)
+MODELS, TASK_FILES, VEHICLE_FILES = (".safetensors", ".onnx", ".zip"), (".toml",), (".toml", ".urdf", ".sdf", ".xml")
 
 
 def script(app: App, shell: Any) -> str:
@@ -79,6 +79,13 @@ def controllers(context: "CompletionContext") -> list[str]:
     name, at, _ = context.incomplete.partition("@")
     gains = [f"{name}@{each}" for each in ("textbook", "tuned") if at and name in CLASSICAL]
     return [*shipped(CONTROLLER), *gains, *_paths(context.incomplete, MODELS)]
+
+
+def vehicles(context: "CompletionContext") -> list[str]:
+    """Vehicles that ship, and files of vehicles."""
+    from flytune.config.recognise import VEHICLE, shipped
+
+    return [*shipped(VEHICLE), *_paths(context.incomplete, VEHICLE_FILES)]
 
 
 def edits(context: "CompletionContext") -> list[str]:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from cyclopts import Parameter
 
+from flytune.cli.completion import completed_by, vehicles
 from flytune.cli.options import AsJson
 from flytune.errors import BadInput
 
@@ -21,6 +22,7 @@ Source = Annotated[
         help="a vehicle that ships, its own file (.toml), or the file of another program: .urdf as in "
         "gym-pybullet-drones or with the motor models of Gazebo, .sdf of Gazebo and PX4, .xml of MuJoCo",
     ),
+    completed_by(vehicles),
 ]
 Out = Annotated[Path | None, Parameter(name="--out", metavar="FILE.toml", help="write the vehicle to this file")]
 

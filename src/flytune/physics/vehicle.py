@@ -293,6 +293,11 @@ def vehicle_table(name: str, folder: Path = Path(), where: str = "") -> dict[str
         path = folder / Path(name).expanduser()
         beside = " A path in a file is relative to the folder of that file." if where else ""
         return {"name": path.stem, **document.load(path, f"{where}vehicle: ", f"Give a vehicle's file.{beside}")}
+    if name.endswith((".urdf", ".sdf", ".xml")):
+        raise BadInput(
+            f"{where}vehicle: {name} is a model of another program. Make a vehicle of it: flytune vehicle {name} --out "
+            "mine.toml."
+        )
     file = f"{name}.toml"
     hint = file if os.path.isfile(folder / file) else document.nearest(name, vehicle_names())
     raise BadInput(
