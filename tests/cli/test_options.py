@@ -13,11 +13,11 @@ from flytune.cli.options import assignments
 
 OPTIONS = {
     "train": "TASK --trainer --seed --steps --out --set --from --resume --tensorboard --json",
-    "evaluate": "CONTROLLER --task --world --world-set --trials --seed --duration --starts --dial --json --out "
+    "evaluate": "CONTROLLER --task --world --world-set --trials --seed --duration --starts --dial --set --json --out "
     "--flights",
-    "compare": "CONTROLLER --task --world --world-set --trials --seed --duration --starts --dial --json --out "
+    "compare": "CONTROLLER --task --world --world-set --trials --seed --duration --starts --dial --set --json --out "
     "--flights",
-    "report": "CONTROLLER --task --world --world-set --trials --seed --duration --starts --dial --out",
+    "report": "CONTROLLER --task --world --world-set --trials --seed --duration --starts --dial --set --out",
     "judge": "FILE --columns --target --start --gap --json",
     "map": "CONTROLLER --dial --measure --json",
     "tune": "TASK --settling-time --at-most --tolerance --overshoot --error --axis --percentile --set --rules "
@@ -28,6 +28,7 @@ OPTIONS = {
     "export": "CONTROLLER --format --out",
     "list": "--json",
     "show": "TASK --set",
+    "vehicle": "VEHICLE --out --json",
     "bench": "WHAT --json",
     "completion": "SHELL",
 }
