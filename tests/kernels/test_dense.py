@@ -11,6 +11,8 @@ from jax.flatten_util import ravel_pytree
 from flytune.control.policy import make_network
 from flytune.kernels.batched import available
 from flytune.kernels.dense import perceptron, plain
+from flytune.kernels.native import module, register
+from flytune.kernels.writer import Writer
 
 pytestmark = pytest.mark.skipif(not available(), reason="no kernels on this machine")
 
@@ -49,6 +51,23 @@ def test_outputs_and_gradients_are_those_of_jax(sizes, batch, squash):
     assert jax.tree.structure(found) == jax.tree.structure(expected)
     for one, other in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
         np.testing.assert_allclose(one, other, atol=3e-6 * batch**0.5, rtol=2e-5)
+
+
+@pytest.mark.parametrize("columns", [1, 3, 7, 8, 9, 16])
+@pytest.mark.parametrize("rows", [4, 8, 64])
+def test_a_transposition_writes_nothing_behind_its_matrix(rows, columns):
+    room, size = 1024, rows * columns
+    writer = Writer()
+    writer.copy(None, "%out0", size + room)
+    writer.transpose("%in0", "%out0", rows, columns)
+    given = np.zeros(size + room, np.float32)
+    given[:size] = np.arange(1, size + 1)
+    name, text = module([writer.function("turned", 1, 1)], "turned", 1, 1)
+    register(name, text)
+    kind = jax.ShapeDtypeStruct((size + room,), jnp.float32)
+    (found,) = jax.ffi.ffi_call(name, [kind])(jnp.asarray(np.where(given == 0, 7.0, given), jnp.float32))
+    np.testing.assert_array_equal(found[:size], given[:size].reshape(rows, columns).T.ravel())
+    assert not np.asarray(found[size:]).any()
 
 
 def test_infinite_and_missing_numbers_stay_visible():

@@ -44,7 +44,9 @@ class Writer:
         self._lines.append(f"  store {_vector(width)} {value}, ptr {pointer}, align 4")
 
     def each(self, number: int, body: Callable[[str], Any], metadata: str = "") -> None:
-        """A loop; `body` writes the instructions of the index it is given."""
+        """A loop; `body` writes the instructions of the index it is given. Without an index nothing is written."""
+        if number == 0:  # the condition stands behind the body
+            return
         self._count += 1
         name = f"loop{self._count}"
         before, index, following = self._block, f"%i{self._count}", f"%n{self._count}"
