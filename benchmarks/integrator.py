@@ -22,7 +22,7 @@ from scipy.integrate import solve_ivp
 from flytune.physics import dynamics, rotation
 from flytune.physics.components import Components, add, scale, unpack
 from flytune.physics.dynamics import CONTROL_PERIOD, State
-from flytune.physics.rotors import thrust_and_torque
+from flytune.physics.rotors import commanded_rotor_speed, thrust_and_torque
 from flytune.physics.vehicle import Vehicle, load_vehicle
 
 STEPS = 200  # control periods, 2 s
@@ -74,7 +74,7 @@ def classical(vehicle: Vehicle, state: State, action: jax.Array, physics_steps: 
     body, now = (state.position, state.attitude, state.velocity, state.body_rate), state.rotor_speed_rpm
     h = CONTROL_PERIOD / physics_steps
     queue = jnp.concatenate([state.pending_actions, action[None]])
-    goal = tuple(dynamics.commanded_rotor_speed(vehicle, motor) for motor in unpack(queue[0]))
+    goal = tuple(commanded_rotor_speed(vehicle, motor) for motor in unpack(queue[0]))
     rates = rates_of_arrays if arrays else rates_of_scalars
     if arrays:
         body, now, goal = jax.tree.map(jnp.stack, (body, now, goal), is_leaf=lambda x: isinstance(x[0], jax.Array))

@@ -10,6 +10,7 @@ import os
 
 os.environ.setdefault("XLA_FLAGS", "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1")
 
+import dataclasses
 import math
 import sys
 from pathlib import Path
@@ -31,7 +32,7 @@ from flytune.physics.dynamics import CONTROL_PERIOD
 from flytune.physics.rotors import places, spins
 from flytune.physics.vehicle import Vehicle, load_vehicle
 from flytune.simulation.actuator import Actuator
-from flytune.simulation.aerodynamics import ground_effect, rotor_drag
+from flytune.simulation.aerodynamics import ground_effect
 from flytune.simulation.simulator import VehicleStates, to_inertial
 from flytune.simulation.simulators import make_simulator
 from flytune.task.files import load_task
@@ -69,7 +70,8 @@ def equations(
         )
         pull = to_inertial(q[None], np.array([[0, 0, thrust.sum()]]))[0] - drag * v
         if rotors_drag:
-            pull = pull + rotor_drag(vehicle, q[None], v[None], rpm[None])[0]
+            slowed = dataclasses.replace(vehicle, rotor_drag=vehicle.optional_rotor_drag)
+            pull = pull + to_inertial(q[None], drag(slowed, q[None], v[None], rpm[None]))[0]
         twist = np.cross(w, inertia * w) if gyroscopic else 0.0
         turn = 0.5 * np.array([*(q[3] * w + np.cross(q[:3], w)), -q[:3] @ w])
         gravity = np.array([0, 0, vehicle.gravity])

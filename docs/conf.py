@@ -10,7 +10,15 @@ sys.path[:0] = [str(HERE / "_ext"), str(HERE.parent / "src")]
 project = "flytune"
 author = "the flytune contributors"
 release = metadata.version("flytune")
-extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "commands", "task_file", "api"]
+extensions = [
+    "myst_parser",
+    "sphinx.ext.autodoc",
+    "sphinx.ext.napoleon",
+    "commands",
+    "task_file",
+    "vehicle_page",
+    "api",
+]
 exclude_patterns = ["_ext"]
 html_theme = "furo"
 html_title = "flytune"

@@ -20,20 +20,20 @@ AIRFRAMES: dict[str, dict[str, Any]] = {
         "torque_coefficient": 1.7545963e-11, "propeller_radius": 0.04, "maximum_rotor_speed_rpm": 42016.9,
         "motor_rise_time_constant": 0.033, "motor_fall_time_constant": 0.033,
     },
-    # rotorpy, hummingbird
-    "hummingbird": _SHARED | {
+    # rotorpy, hummingbird in x configuration
+    "hummingbird x": _SHARED | {
         "mass": 0.5, "inertia": [0.00365, 0.00368, 0.00703], "arm": 0.17, "thrust_coefficient": 6.1081885e-8,
         "torque_coefficient": 1.4914069e-9, "propeller_radius": 0.1, "maximum_rotor_speed_rpm": 14323.9,
         "motor_rise_time_constant": 0.005, "motor_fall_time_constant": 0.005,
     },
     # gym-pybullet-drones, racer.urdf, whose propeller radius is that of a propeller of 10 inches
-    "racer": _SHARED | {
+    "racer of ten inches": _SHARED | {
         "mass": 0.83, "inertia": [0.003113, 0.003113, 0.003113], "arm": 0.108541, "thrust_coefficient": 8.47e-9,
         "torque_coefficient": 2.13e-11, "propeller_radius": 0.127, "maximum_rotor_speed_rpm": 31657.0,
         "motor_rise_time_constant": 0.0, "motor_fall_time_constant": 0.0,
     },
-    # PX4, x500
-    "x500": _SHARED | {
+    # PX4, x500, its base link alone with an arm
+    "x500 base": _SHARED | {
         "mass": 2.064308, "inertia": [0.0216667, 0.0216667, 0.04], "arm": 0.246073, "thrust_coefficient": 9.374567e-8,
         "torque_coefficient": 1.4999307e-9, "propeller_radius": 0.128, "maximum_rotor_speed_rpm": 9549.3,
         "motor_rise_time_constant": 0.0125, "motor_fall_time_constant": 0.025,

@@ -2,6 +2,7 @@
 
 import ast
 import importlib
+import importlib.util
 import re
 import shlex
 import tomllib
@@ -59,3 +60,18 @@ def test_every_task_file_can_be_loaded(block, tmp_path):
     assert tomllib.loads(block)["based_on"]
     (tmp_path / "mine.toml").write_text(block, encoding="utf-8")
     assert load_task(tmp_path / "mine.toml").name == "mine"
+
+
+def test_the_drawing_of_a_layout_shows_each_rotor_where_it_is_and_how_it_turns():
+    pytest.importorskip("sphinx", reason="needs flytune[docs]")
+    file = ROOT / "docs" / "_ext" / "vehicle_page.py"
+    spec = importlib.util.spec_from_file_location("vehicle_page", file)
+    page = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(page)
+    image = page.drawing("hummingbird")
+    # front, left, back, right: x is up and y to the left; the front and the back turn clockwise (sweep 1)
+    middles = [tuple(map(float, each)) for each in re.findall(r'cx="([-.\d]+)" cy="([-.\d]+)"', image)]
+    assert [(x > 1) - (x < -1) for x, _ in middles] == [0, -1, 0, 1]
+    assert [(y > 1) - (y < -1) for _, y in middles] == [-1, 0, 1, 0]
+    assert re.findall(r"A[-.\d]+ [-.\d]+ 0 0 (\d)", image) == ["1", "0", "1", "0"]
+    assert re.findall(r">(\d: [+-]1)<", image) == ["0: +1", "1: -1", "2: +1", "3: -1"]

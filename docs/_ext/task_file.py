@@ -49,6 +49,8 @@ def unit(annotation: Any) -> str:
     base, details = plain(annotation)
     if get_origin(base) is tuple:
         return unit(get_args(base)[0])
+    if get_origin(base) in (Union, types.UnionType) and not details:
+        return unit(get_args(base)[0])
     return next((detail.unit for detail in details if isinstance(detail, annotated_types.Unit)), "")
 
 

@@ -58,6 +58,7 @@ BACK[300:] -= 1
 HEADER, TO = "t,x,y,z,yaw", ["--target", "0,0,1,0"]
 TARGETS = f"{HEADER},target_x,target_y,target_z,target_yaw"
 LOG = (HEADER, TIME, X, Y, Z, YAW)
+LONG = [0.5 * np.arange(4001), *(np.repeat(each, 5)[:4001] for each in (X, Y, Z, YAW))]
 WRONG = {  # what is in the file, further arguments, what is said, and where there is one: the remedy that then works
     "no target": (LOG, [], "no column is a target. Give --target x,y,z,yaw", TO),
     "no yaw": (("t,x,y,z", TIME, X, Y, Z), TO, r"no column is yaw. Found: t, x, y, z. Give .*yaw=0\.",
@@ -70,8 +71,16 @@ WRONG = {  # what is in the file, further arguments, what is said, and where the
                 ["--columns", "yaw=yaw[deg]"]),
     "millimetres": ((HEADER, TIME, X * 1e3, Y, Z, YAW), TO, r"x goes to 1000, and nothing says its unit",
                     ["--columns", "x=x[mm]"]),
-    "a time in minutes": ((HEADER, TIME * 30, X, Y, Z, YAW), TO, r"a step of 0.3 .* fits no unit for sure",
-                          ["--columns", "time=t[s]", "--gap", "0.3"]),
+    "3 Hz": ((HEADER, TIME * 30, X, Y, Z, YAW), TO, r"no sample from .* \(0.30 s\).*Give --gap 0.31",
+             ["--gap", "0.31"]),
+    "2 Hz in milliseconds": (("Timestamp,x,y,z,yaw", TIME[::50] * 1e3, X[::50], Y[::50], Z[::50], YAW[::50]), TO,
+                             r"no sample from 0.00 to 0.50 s .*Give --gap 0.51", ["--gap", "0.51"]),
+    "1 Hz": (("Timestamp,x,y,z,yaw", TIME[::100], X[::100], Y[::100], Z[::100], YAW[::100]), TO,
+             r"a step of 1 .* fits no unit for sure \(in s it is 1 Hz for 8 s; in ms it is 1000 Hz for 0.008 s",
+             ["--columns", "time=Timestamp[s]", "--gap", "1"]),
+    "2 Hz or 2 kHz": (("Timestamp,x,y,z,yaw", *LONG), TO,
+                      r"fits no unit for sure \(in s it is 2 Hz for 2000 s; in ms it is 2000 Hz for 2 s\)",
+                      ["--columns", "time=Timestamp[ms]", "--gap", "1"]),
     "a gap": ((HEADER, *(each[GAP] for each in (TIME, X, Y, Z, YAW))), TO,
               r"no sample from 3.24 to 4.76 s .*Give --gap 1.53", ["--gap", "1.53"]),
     "a time that goes back": ((HEADER, BACK, X, Y, Z, YAW), TO, r"goes back from 2.99 to 2 s \(sample 301\)", None),
@@ -148,7 +157,7 @@ def test_a_file_that_is_too_large_is_refused_before_it_is_read(tmp_path, capsys)
 ARRAYS = {"time": TIME, "position": np.stack([X, Y, Z], axis=-1), "yaw": YAW, "target_position": [0.0, 0.0, 1.0]}
 NPZ = {
     "no yaw": ({"yaw": None}, "has no array yaw. Found: time, position, target_position"),
-    "no target": ({"target_position": None}, "has no array target_position"),
+    "no target": ({"target_position": None}, "position, yaw. Give --target x,y,z,yaw in m and rad."),
     "words": ({"yaw": np.array(["a"] * 801)}, "yaw holds <U1, not numbers"),
     "objects": ({"yaw": np.array([{}] * 801)}, "is no file of flights (Object arrays cannot be loaded"),
     "another length": ({"yaw": YAW[:-1]}, "yaw: the shape (1, 800, 1) is not allowed with time (801,)"),
@@ -161,6 +170,13 @@ def test_arrays_that_cannot_be_used_are_refused_in_one_line(tmp_path, capsys, ca
     changes, reason = NPZ[case]
     np.savez(tmp_path / "own.npz", **{name: each for name, each in (ARRAYS | changes).items() if each is not None})
     assert reason in refused("judge", tmp_path / "own.npz", capsys=capsys)
+
+
+@pytest.mark.parametrize("target", ["0,0,1,0", "[0, 0, 1, 0]", "0 0 1 0"])
+def test_arrays_without_a_target_are_judged_by_the_one_that_is_given(tmp_path, capsys, target):
+    np.savez(tmp_path / "own.npz", **{name: each for name, each in ARRAYS.items() if name != "target_position"})
+    assert main(["judge", str(tmp_path / "own.npz"), "--target", target, "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["position"]["settled"] == 1
 
 
 def test_flights_that_hold_their_target_take_no_other_and_no_columns(tmp_path, monkeypatch, capsys):
@@ -181,3 +197,16 @@ def test_an_angle_whose_unit_nothing_says_is_named_with_the_way_to_say_it(tmp_pa
     assert main(["judge", "log.csv", "--target", "0,0,1,0"]) == 0
     said = capsys.readouterr().err
     assert ("taken as rad. For degrees, give --columns 'yaw=yaw[deg]'" in said) == guessed
+
+
+@pytest.mark.parametrize(
+    ("unit", "factor", "rate"),
+    [("s", 1.0, 5), ("ms", 1e3, 4), ("ms", 1e3, 1000), ("us", 1e6, 250), ("ns", 1e9, 100), ("us", 1e6, 2)],
+)
+def test_the_unit_of_time_that_nothing_says_is_the_plausible_one_and_is_told(tmp_path, capsys, unit, factor, rate):
+    time = np.arange(0, 8 + 1e-9, 1 / rate)
+    written(tmp_path / "log.csv", "Timestamp,x,y,z,yaw", 1e5 + time * factor, *flown(time))
+    assert main(["judge", str(tmp_path / "log.csv"), *TO, "--gap", "0.6"]) == 0
+    said = capsys.readouterr()
+    assert f"time = Timestamp [{unit}]" in said.err and "1 flight of 8 s" in said.out
+    assert (f"taken as {unit}, in which" in said.err) == (unit != "s")

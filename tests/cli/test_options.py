@@ -13,11 +13,11 @@ from flytune.cli.options import assignments
 
 OPTIONS = {
     "train": "TASK --trainer --seed --steps --out --set --from --resume --tensorboard --json",
-    "evaluate": "CONTROLLER --task --world --world-set --trials --seed --duration --starts --dial --json --out "
+    "evaluate": "CONTROLLER --task --world --world-set --trials --seed --duration --starts --dial --set --json --out "
     "--flights",
-    "compare": "CONTROLLER --task --world --world-set --trials --seed --duration --starts --dial --json --out "
+    "compare": "CONTROLLER --task --world --world-set --trials --seed --duration --starts --dial --set --json --out "
     "--flights",
-    "report": "CONTROLLER --task --world --world-set --trials --seed --duration --starts --dial --out",
+    "report": "CONTROLLER --task --world --world-set --trials --seed --duration --starts --dial --set --out",
     "judge": "FILE --columns --target --start --gap --json",
     "map": "CONTROLLER --dial --measure --json",
     "tune": "TASK --settling-time --at-most --tolerance --overshoot --error --axis --percentile --set --rules "
@@ -27,7 +27,8 @@ OPTIONS = {
     "reproduce": "--trainer --seeds --steps --refined --out --json",
     "export": "CONTROLLER --format --out",
     "list": "--json",
-    "show": "TASK",
+    "show": "TASK --set",
+    "vehicle": "VEHICLE --out --json",
     "bench": "WHAT --json",
     "completion": "SHELL",
 }
@@ -93,6 +94,9 @@ def test_defaults_and_units_are_shown(capsys):
     assert "number of trials [default: 100]" in shown
     assert "--duration S length of each trial, in seconds (default: the task's own)" in shown
     assert "[choices: flytune, pybullet, mujoco] [default: flytune]" in shown
+    main(["tune", "--help"])
+    shown = " ".join(capsys.readouterr().out.replace("│", " ").split())
+    assert "[choices: position, x, y, z, yaw] [default: position]" in shown
 
 
 def test_assignments_may_follow_one_option_or_repeat_it():
@@ -104,6 +108,11 @@ def test_assignments_may_follow_one_option_or_repeat_it():
 
 def test_of_two_values_of_one_path_the_last_one_counts():
     assert assignments(("a.b=1", "c=3", "a.b=2")) == {"a.b": 2, "c": 3}
+
+
+def test_a_whole_number_may_be_written_as_a_float():
+    *_, options = parsed("train", "baseline", "--steps", "1e6", "--seed", "3.0")
+    assert (options.steps, options.seed) == (1_000_000, 3) and isinstance(options.steps, int)
 
 
 def test_an_option_that_is_given_twice_counts_as_given_last():
@@ -144,6 +153,8 @@ REFUSED = {
     "evaluate pid --world mars": "--world: 'mars' is not allowed. Allowed: flytune, pybullet, mujoco.",
     "evaluate pid --starts cloudy": "--starts: 'cloudy' is not allowed. Allowed: clear, paper.",
     "evaluate pid --trials 3.7": "--trials: '3.7' is not allowed. Allowed: a whole number.",
+    "evaluate pid --trials 1e-2": "--trials: '1e-2' is not allowed. Allowed: a whole number.",
+    "evaluate pid --trials inf": "--trials: 'inf' is not allowed. Allowed: a whole number.",
     "evaluate pid --duration soon": "--duration: 'soon' is not allowed. Allowed: a number.",
     "evaluate pid --json=3": "--json: '3' is not allowed. Allowed: the option without a value.",
     "evaluate": "CONTROLLER: a value is missing. Give CONTROLLER: a run directory,",
@@ -155,7 +166,16 @@ REFUSED = {
     "tune": "--settling-time: a value is missing. Give --settling-time S: wanted settling time, in seconds",
     "export pid --out x": "--format: a value is missing. Give --format onnx|safetensors:",
     "bench sleep": "WHAT: 'sleep' is not allowed. Allowed: all, train, simulate.",
-    "compare pid --seed 1 lqr": "'lqr': a value is not expected here. TASK and CONTROLLER stand before the options.",
+    "compare pid --seed 1 lqr": "'lqr': a value is not expected here. CONTROLLER stands before the options.",
+    "evaluate pid lqr": "'lqr': a value is not expected here. One CONTROLLER is allowed, before the options. `flytune "
+    "compare` takes several.",
+    "show a b": "'b': a value is not expected here. One TASK is allowed, before the options.",
+    "list x": "'x': a value is not expected here. list takes options alone.",
+    "judge f.csv --target 0 0 1 0": "--target: 4 values are not allowed. Allowed: one, X,Y,Z,YAW. Write --target "
+    "0,0,1,0.",
+    "judge f.csv --target -1 0": "--target: 2 values are not allowed. Allowed: one, X,Y,Z,YAW. See",
+    "compare pid lqr --sets x=1": "--sets: there is no such option. Did you mean --set?",
+    "map dial --set x=1": "--set: is no option of map. Edits of a task belong to train, tune and show. See",
 }
 
 

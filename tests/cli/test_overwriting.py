@@ -45,6 +45,13 @@ def test_an_evaluation_of_a_run_on_another_task_is_kept_under_the_name_of_that_t
     assert json.loads((here / "mine" / "evaluation.json").read_text())["trials"] == 3
 
 
+def test_a_report_into_a_folder_is_called_report_html_and_one_without_suffix_as_it_is_named(here, capsys):
+    for out, written in (("mine", "mine/report.html"), ("page", "page")):
+        assert main(["report", "mine", *FLY, "--out", out]) == 0
+        assert capsys.readouterr().out.splitlines()[-1] == written
+        assert (here / written).read_text(encoding="utf-8").startswith("<!DOCTYPE html>")
+
+
 TAKEN = [
     (["evaluate", "pid", *FLY, "--out", "mine"], "out: mine is the run directory of another training"),
     (["evaluate", "pid", *FLY, "--flights", "notes"], "flights: notes is there and is not a file of flights"),
@@ -56,7 +63,8 @@ TAKEN = [
     (["report", "pid", *FLY, "--out", "mine/run.json"], "out: mine/run.json is a file of a run"),
     (["export", "baseline-refined", "--format", "safetensors", "--out", "notes"], "out: notes is there and is not"),
     (["export", "baseline-refined", "--format", "safetensors", "--out", "mine/policy.safetensors"], "file of a run"),
-    (["export", "mine", "--format", "onnx", "--out", "copy.safetensors"], "out: copy.safetensors is there"),
+    (["export", "mine", "--format", "onnx", "--out", "copy.onnx"], "out: copy.onnx is there"),
+    (["export", "mine", "--format", "onnx", "--out", "copy.safetensors"], "whose name ends in .onnx. Did you"),
     (["train", "baseline", "--out", "notes"], "out: notes is a file"),
     (["train", "baseline", "--out", "link"], "out: link is a file"),
     (["train", "baseline", "--out", "own"], "out: own is no run and holds task.toml, which is not replaced"),
@@ -73,7 +81,8 @@ def test_what_somebody_else_wrote_is_not_replaced(here, capsys, arguments, reaso
     (here / "own" / "task.toml").write_text('based_on = "baseline"\n')
     (here / "pages" / "iterations").mkdir(parents=True)
     (here / "pages" / "comparison.html").write_text("<html>mine</html>")
-    shutil.copyfile(here / "mine" / "policy.safetensors", here / "copy.safetensors")
+    for name in ("copy.onnx", "copy.safetensors"):
+        shutil.copyfile(here / "mine" / "policy.safetensors", here / name)
     before = files(here)
     said = refused(*arguments, capsys=capsys)
     assert said.startswith(reason) or reason in said

@@ -39,6 +39,9 @@ def here(tmp_path, monkeypatch, small_run):
     directory.checkpoint(method.start(task, jax.random.key(0)), [])
     (tmp_path / "file").touch()
     (tmp_path / "mine.toml").write_text('based_on = "baseline"\n[apg]\nleeway = 0.5\n')
+    (tmp_path / "task.toml").write_text('based_on = "baseline"\nduration = 1.0\n')
+    (tmp_path / "notes.html").write_text("mine")
+    shutil.copytree(small_run, Path("runs") / "known")
     (tmp_path / "rules.toml").write_text("")
     return tmp_path
 
@@ -122,7 +125,32 @@ REMEDIES = [  # what is typed, what the message says, and what is typed after re
      swap("dial@settling_time=4,speed=0.5", "dial@settling_time=4")),
     ([*EVALUATE, "--dial", "speed=1"], r"for instance (dial@speed=0\.5)", swap("pid", "dial@speed=0.5")),
     (["compare", "pid", *FLY], r"two or more\. Name another", beside("lqr")),
-    (["report", "pid", *FLY, "--out", "mine.toml"], r"Give another path, or remove", swap("mine.toml", "page.html")),
+    (["report", "pid", *FLY, "--out", "notes.html"], r"Give another path, or remove", swap("notes.html", "page.html")),
+    (["report", "pid", *FLY, "--out", "page.pdf"], r"Did you mean (\S+)\?", swap("page.pdf", None)),
+    ([*EVALUATE, "--flights", "f.csv"], r"Did you mean (\S+)\?", swap("f.csv", None)),
+    (["compare", "pid", "lqr", *FLY, "--flights", "f.csv"], r"Did you mean (\S+)\?", swap("f.csv", None)),
+    (["compare", "pid", "lqr", *FLY, "--out", "c.html"], r"Did you mean (\S+)\?", swap("c.html", None)),
+    (["train", "mine/task.toml", "--out", "p.safetensors"], r"Did you mean (\S+)\?", swap("p.safetensors", None)),
+    (["export", "mine", "--format", "safetensors", "--out", "p.onnx"], r"Did you mean (\S+)\?", swap("p.onnx", None)),
+    (["evaluate", "baseline", *FLY], r"Did you mean ([\w-]+)\?", swap("baseline", None)),
+    (["evaluate", "pids", *FLY], r"Did you mean (\w+)\?", swap("pids", None)),
+    (["show", "tsk.toml"], r"no such file\. Did you mean (\S+)\?", swap("tsk.toml", None)),
+    (["evaluate", "pid@texbook", *FLY], r"Did you mean (\w+)\?", swap("pid@texbook", "pid@textbook")),
+    (["evaluate", "known", *FLY], r"Did you mean (\S+)\?", swap("known", None)),
+    (["evaluate", "runs/knwon", *FLY], r"Did you mean (\S+)\?", swap("runs/knwon", None)),
+    (["evaluate", "mine/task.toml", *FLY], r"Did you mean its run, (\w+)\?", swap("mine/task.toml", None)),
+    (["evaluate", "runs", *FLY], r"It holds the runs (\S+)\.\n", swap("runs", None)),
+    (["show", "known"], r"Did you mean (\S+)\?", swap("known", None)),
+    (["evaluate", "dial@settling=4", *FLY], r"Did you mean (\w+)\?", swap("settling", None)),
+    (["show", "pid"], r"Fly it: flytune (.*)\.\n", printed),
+    (["evaluate", "task.toml", *FLY], r"or fly it: flytune (.*)\.\n", printed),
+    (["show", "baseline", "--set", "target_yaw=1"], r"Did you mean ([\w.]+)\?", swap("target_yaw", None)),
+    (["show", "baseline", "--set", "target.position=0,0,2"], r"For instance (\S+)\.\n",
+     swap("target.position=0,0,2", None)),
+    (["show", "baseline", "--set", "target.position=[1,0]"], r"For instance (\S+)\.\n",
+     swap("target.position=[1,0]", None)),
+    (["show", "baseline", "--set", "vehicle.rotor_drag=some"], r'"(none)" removes it', swap("some", None)),
+    (["show", "baseline", "--set", "termination.speed=3"], r'"(none)" removes it', swap("3", None)),
     (["export", "pid", "--format", "safetensors", "--out", "p"], r"or one that ships", swap("pid", "baseline-refined")),
     (["export", "mine", "--format", "safetensor", "--out", "p"], r"Did you mean (\w+)\?", swap("safetensor", None)),
     (["map", "pid"], r"for instance (dial)\.", swap("pid", None)),

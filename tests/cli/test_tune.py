@@ -1,6 +1,7 @@
 """`flytune tune` and `flytune rules` as a user meets them: real processes, exit codes, and what they leave behind."""
 
 import json
+import re
 
 import pytest
 from tests.command import flytune, interrupted, refused
@@ -69,8 +70,10 @@ def test_several_axes_are_asked_for_at_once_each_with_its_own_bounds(tmp_path):
         "--percentile",
         "yaw=90",
     ]
-    told = json.loads(flytune("tune", "--settling-time", "4", *arguments, "--json", cwd=tmp_path).stdout)
+    answer = flytune("tune", "--settling-time", "4", *arguments, "--json", cwd=tmp_path)
+    told = json.loads(answer.stdout)
     assert told["met"]
+    assert re.search(r"settles in [\d.]+ s \(position\), [\d.]+ s \(yaw\), overshoot", answer.stderr)
     assert (
         "yaw settles no later (percentile 90 of the trials), overshoot at most 8 %, error at most 0.5 deg"
         in told["title"]

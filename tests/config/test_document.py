@@ -141,10 +141,35 @@ def test_an_empty_optional_field_is_left_out():
     ("changes", "message"),
     [
         ({"mass": "heavy"}, "mass: 'heavy' is not allowed. Allowed: 0 or more kg."),
-        ({"doors": 2.0}, "doors: 2.0 is not allowed. Allowed: a whole number, 1 to 5."),
+        ({"doors": 2.5}, "doors: 2.5 is not allowed. Allowed: a whole number, 1 to 5."),
         ({"doors": True}, "doors: True is not allowed. Allowed: a whole number, 1 to 5."),
         ({"doors": 6}, "doors: 6 is not allowed. Allowed: a whole number, 1 to 5."),
         ({"centre": [0.0, 0.0, float("nan")]}, "centre.2: nan is not allowed. Allowed: a finite number."),
+        (
+            {"centre": "0,0,1"},
+            "centre: '0,0,1' is not allowed. Allowed: 3 values, each a finite number. For instance centre=[0,0,1].",
+        ),
+        (
+            {"centre": [1.5, 2.0]},
+            "centre: [1.5, 2.0] is not allowed. Allowed: 3 values, each a finite number. For "
+            "instance centre=[1.5,2.0,0].",
+        ),
+        (
+            {"centre": [1, 2, 3, 4]},
+            "centre: [1, 2, 3, 4] is not allowed. Allowed: 3 values, each a finite number. For "
+            "instance centre=[1,2,3].",
+        ),
+        (
+            {"centre": 7},
+            "centre: 7 is not allowed. Allowed: 3 values, each a finite number. For instance centre=[7,0,0].",
+        ),
+        ({"centre": "home"}, "centre: 'home' is not allowed. Allowed: 3 values, each a finite number."),
+        ({"wheels_left_radius": 1.0}, "wheels_left_radius: no such field. Did you mean wheels.left.radius?"),
+        (
+            {"wheels": {"left": {"radius": 1.0}, "left_radius": 1.0}},
+            "wheels.left_radius: 1.0 is not allowed. Allowed: a table. Did you mean wheels.left.radius?",
+        ),
+        ({"left-radius": 1.0}, "left-radius: no such field. Did you mean wheels.left.radius?"),
         ({"wheels": {"left": {"radius": 0}}}, "wheels.left.radius: 0 is not allowed. Allowed: above 0 m."),
         ({"wheels": {"left": {}}}, "wheels.left.radius: missing. Allowed: above 0 m."),
         (
@@ -158,6 +183,11 @@ def test_a_bad_value_is_refused_with_its_path_its_value_and_what_is_allowed(chan
     with pytest.raises(BadInput) as caught:
         document.read(Car, document.plain(CAR) | changes, where="car.toml")
     assert str(caught.value) == f"car.toml: {message}"
+
+
+def test_a_float_without_a_fraction_will_do_for_a_whole_number_and_becomes_one():
+    doors = document.read(Car, document.plain(CAR) | {"doors": 4.0}).doors
+    assert (doors, type(doors)) == (4, int)
 
 
 def test_a_whole_number_will_do_for_a_real_one():

@@ -120,7 +120,7 @@ def test_a_metric_that_applies_to_no_trial_has_neither_median_nor_interval(make_
     comparison = compare(controllers)
     told = difference(comparison, "position.overshoot").to_dict()
     assert (told["median"], told["low"], told["high"], told["left_out"]) == (None, None, None, 3)
-    assert "b overshoots: no trial to compare with a" in comparison.table().replace("    overshoots", "b overshoots")
+    assert "    has no trial whose position overshoot can be compared with that of a" in comparison.table()
 
 
 # --- the interval ---
@@ -225,7 +225,6 @@ def test_the_dictionary_has_the_published_keys_and_is_json(make_judgement):
     [
         ([{}, {}, {}], ("pid", "pid (2)", "pid (3)")),
         ([{"simulator": "flytune"}, {"simulator": "mujoco"}], ("pid (flytune)", "pid (mujoco)")),
-        ([{"task": "baseline"}, {"task": "acrobatic"}], ("pid (baseline)", "pid (acrobatic)")),
         ([{"simulator": "mujoco"}, {"simulator": "mujoco"}, {"name": "apg"}], ("pid", "pid (2)", "apg")),
         ([{}, {}, {"name": "pid (2)"}], ("pid", "pid (2)", "pid (2) (2)")),
         ([{"name": ""}, {"name": ""}], ("controller", "controller (2)")),
@@ -242,6 +241,7 @@ def test_controllers_of_one_name_are_told_apart(make_judgement, flown, names):
     [
         ({"trials": 6}, "trials: 5 for apg and 6 for pid is not allowed. Allowed: the same for every controller."),
         ({"seed": 2}, "seed: 1 for apg and 2 for pid"),
+        ({"task": "acrobatic"}, "task: baseline for apg and acrobatic for pid"),
         ({"initial_conditions": "paper"}, "starts: clear for apg and paper for pid"),
         ({"duration": 20.0}, "duration: 10.0 s for apg and 20.0 s for pid"),
     ],
@@ -299,12 +299,34 @@ def test_an_interval_that_holds_zero_says_both_ways(make_judgement):
     )
 
 
-def test_a_controller_that_leaves_unsettled_what_the_other_settles_is_infinitely_later(make_judgement):
+def test_a_controller_that_leaves_unsettled_what_the_other_settles_is_said_not_to_settle(make_judgement):
     controllers = [make_judgement("apg", settling=[1.0] * 9), make_judgement("pid", settling=[INFINITE] * 9)]
-    assert "pid settles infinitely later than apg (95 % interval likewise), later in 9 of 9 trials" in str(
-        compare(controllers)
+    assert "pid does not settle where apg settles, later in 9 of 9 trials" in str(compare(controllers))
+    assert "apg settles where pid does not settle, earlier in 9 of 9 trials" in str(compare(controllers[::-1]))
+
+
+def test_an_interval_with_one_number_says_where_it_begins_or_ends(make_judgement):
+    settled = np.full(9, 5.0)
+    mostly = np.array([5.5, 6, 6.5, 7, 7.5, *[INFINITE] * 4])  # median 2.5 s later; interval from the second one on
+    told = str(compare([make_judgement("apg", settling=settled), make_judgement("pid", settling=mostly)]))
+    assert "pid settles 2.50 s later than apg (95 % interval from 1.00 on), later in 9 of 9 trials" in told
+    hardly = np.array([4.5, 6, 6.5, 7, *[INFINITE] * 5])
+    told = str(compare([make_judgement("apg", settling=settled), make_judgement("pid", settling=hardly)]))
+    assert "pid does not settle where apg settles (95 % interval from 1.00 on), later in 8 of 9 trials, earlier" in told
+    told = str(compare([make_judgement("pid", settling=hardly), make_judgement("apg", settling=settled)]))
+    assert "apg settles where pid does not settle (95 % interval from 1.00 on), earlier in 8 of 9 trials, later" in told
+
+
+def test_two_controllers_that_both_fail_are_not_said_to_be_equal(make_judgement):
+    lost = [make_judgement(name, settling=[INFINITE] * 9) for name in ("apg", "pid")]
+    assert "pid and apg: neither settles in 9 of 9 trials" in str(compare(lost))
+    errors = dict.fromkeys(lost[0].steady_state_error, np.full(9, INFINITE))
+    crashed = [dataclasses.replace(each, steady_state_error=errors) for each in lost]
+    assert "    both crash in 9 of 9 trials" in str(compare(crashed))
+    half = [make_judgement(name, settling=[INFINITE] * 4 + [time] * 5) for name, time in (("apg", 1.0), ("pid", 2.0))]
+    assert "pid settles 1.00 s later than apg (95 % interval 0 to 1.00), later in 5 of 9 trials, neither in 4" in str(
+        compare(half)
     )
-    assert "apg settles infinitely earlier than pid" in str(compare(controllers[::-1]))
 
 
 def test_equal_controllers_are_said_to_be_equal(make_judgement):
@@ -343,3 +365,10 @@ def test_the_table_has_a_row_per_controller_under_the_conditions_they_share(make
 def test_the_table_says_who_flew_where_if_that_differs(make_judgement):
     table = compare([make_judgement("a", simulator="flytune"), make_judgement("b", simulator="mujoco")]).table()
     assert "world flytune (a), mujoco (b); task baseline;" in table.splitlines()[0]
+
+
+def test_another_vehicle_is_refused_with_the_option_that_gives_all_the_same(make_judgement):
+    with pytest.raises(
+        BadInput, match=r"^vehicle: crazyflie for a and big for b .* Fly all of them with one --task\.$"
+    ):
+        compare([make_judgement("a"), make_judgement("b", vehicle="big")])

@@ -361,3 +361,5 @@ def test_the_table_gives_lengths_in_millimetres_yaw_in_degrees_and_a_dash_for_in
     text = "\n".join(lines)
     assert "crashed 0   infeasible 0   trials that crossed a bound: speed 1" in text
     assert "steps too small for overshoot and rise: x 0, y 2, z 2, yaw 0" in text
+    moving = make_flights(np.linspace(1, 0, 1001)[None, :, None] * np.ones(3), yaw=np.linspace(1, 0, 1001)[None])
+    assert "steps too small" not in str(judge(moving))

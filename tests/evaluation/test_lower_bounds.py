@@ -92,7 +92,7 @@ def test_no_classical_controller_beats_its_bound():
     judged = judge(flights)
     way = flights.target_position - flights.position[:, 0]
     distance = np.linalg.norm(way, axis=1)
-    thrust = float(task.vehicle.thrust_to_weight) * 9.81
+    thrust = float(task.vehicle.full_thrust_to_weight) * 9.81
     climb = way[:, 2] / distance
     bound = lower_bounds.thrust_bound(distance, thrust - 9.81 * climb, thrust + 9.81 * climb)
     assert (judged.settling_time["position"] >= bound).all()

@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+import re
 
 import pytest
 from tests.airframes import AIRFRAMES, airframe
@@ -19,6 +20,8 @@ SLIPS = {  # the unit that is named -> the numbers as they are in that unit
     "Is it in cm? Then write arm": {"arm": 1e2},
     "Is it in mm? Then write propeller_radius": {"propeller_radius": 1e3},
     "Is it in inches? Then write propeller_radius": {"propeller_radius": 1 / 0.0254},
+    "Is it the diameter in inches? Then write propeller_radius": {"propeller_radius": 2 / 0.0254},
+    "Is it the diameter in mm? Then write propeller_radius": {"propeller_radius": 2e3},
     "Are they in mm?": {"arm": 1e3, "propeller_radius": 1e3},
     "Are they in cm?": {"arm": 1e2, "propeller_radius": 1e2},
     "Is it in g?": {"mass": 1e3},
@@ -34,7 +37,7 @@ SLIPS = {  # the unit that is named -> the numbers as they are in that unit
     },
 }  # fmt: skip
 # the propeller radius of gym-pybullet-drones' racer is twice that of its propeller, so that inches look like cm
-AMBIGUOUS = {("racer", "Is it in inches? Then write propeller_radius")}
+AMBIGUOUS = {("racer of ten inches", slip) for slip in SLIPS if "write propeller_radius" in slip}
 CASES = [(name, slip) for name in TABLES for slip in SLIPS if (name, slip) not in AMBIGUOUS]
 
 
@@ -42,6 +45,10 @@ def scaled(table, factors):
     """The table with some numbers in another unit."""
     changed = dict(table)
     for name, factor in factors.items():
+        if name == "arm" and "rotors" in table:
+            place = [[factor * part for part in each] for each in table["rotors"]["place"]]
+            changed["rotors"] = table["rotors"] | {"place": place}
+            continue
         value = table[name]
         changed[name] = [factor * each for each in value] if isinstance(value, list) else factor * value
     return changed
@@ -64,7 +71,17 @@ def test_a_number_in_another_unit_is_refused_and_the_unit_is_named(name, slip):
     with pytest.raises(BadInput) as caught:
         document.read(Vehicle, scaled(TABLES[name], SLIPS[slip]))
     text = str(caught.value)
-    assert slip in text and "Allowed: " in text and "\n" not in text
+    if "rotors" in TABLES[name]:
+        slip = slip.replace("write arm", "write rotors.place")
+    assert slip in text or _also_named(slip, text)
+    assert "Allowed: " in text and "\n" not in text
+
+
+def _also_named(slip, text):
+    """A diameter in inches may be a radius in cm: a factor of 1.27. Then both are named."""
+    return "diameter in inches" in slip and re.search(
+        r"Is it in cm\?.*, or [\d.]+ if it is the diameter in inches", text
+    )
 
 
 @pytest.mark.parametrize(("name", "slip"), CASES)
@@ -72,14 +89,24 @@ def test_what_the_message_says_to_write_is_accepted(name, slip):
     table = scaled(TABLES[name], SLIPS[slip])
     with pytest.raises(BadInput) as caught:
         document.read(Vehicle, table)
-    written = str(caught.value).split("Then write ")[1].rstrip(".")
+    written = str(caught.value).split("Then write ")[1].partition(", or ")[0].rstrip(".")
     # "a = 1, b = [1, 2]" as lines of TOML
-    names = [each for each in TABLES["crazyflie"] if f"{each} = " in written]
+    names = [each for each in (*TABLES["crazyflie"], "rotors.place") if f"{each} = " in written]
     for field in names:
         written = written.replace(f", {field} = ", f"\n{field} = ")
-    vehicle = document.read(Vehicle, table | document.parse(written, "message"))
+    edits = document.parse(written, "message")
+    if "rotors" in edits:
+        edits["rotors"] = table["rotors"] | edits["rotors"]
+    vehicle = document.read(Vehicle, table | edits)
+    assert vehicle.propeller_radius == pytest.approx(TABLES[name]["propeller_radius"], rel=0.3)  # cm or a diameter
     assert vehicle.mass == pytest.approx(TABLES[name]["mass"], rel=1e-5)
     assert vehicle.thrust_coefficient == pytest.approx(TABLES[name]["thrust_coefficient"], rel=1e-5)
+
+
+def test_a_propeller_of_five_inches_is_found_by_its_diameter():
+    with pytest.raises(BadInput, match=r"^propeller_radius: 5.0 .* Is it the diameter in inches\? Then write "
+                       r"propeller_radius = 0\.0635, or 0\.05 if it is in cm\.$"):  # fmt: skip
+        document.read(Vehicle, AIRFRAMES["five inches"] | {"propeller_radius": 5})
 
 
 def test_places_of_rotors_in_mm_are_refused():
@@ -122,10 +149,10 @@ def test_the_figures_of_the_papers_vehicle_are_those_worked_out_by_hand():
 
 
 def test_a_thrust_to_weight_of_12_is_allowed():
-    assert airframe("five inches").thrust_to_weight == pytest.approx(3.46**2)
+    assert airframe("five inches").full_thrust_to_weight == pytest.approx(3.46**2)
 
 
 def test_rotor_drag_in_another_unit_is_refused():
     vehicle = load_vehicle("crazyflie")
-    wrong = dataclasses.replace(vehicle, rotor_drag=tuple(1e3 * each for each in vehicle.rotor_drag))
+    wrong = dataclasses.replace(vehicle, rotor_drag=tuple(1e3 * each for each in vehicle.optional_rotor_drag))
     assert "rotor drag at hover over mass is " in implausible(wrong)

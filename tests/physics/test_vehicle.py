@@ -9,8 +9,6 @@ from flytune.config import document
 from flytune.errors import BadInput
 from flytune.physics.vehicle import Vehicle, load_vehicle, vehicle_names, vehicle_table
 
-NUMBERS = [field.name for field in dataclasses.fields(Vehicle) if field.name not in ("name", "sources", "rotors")]
-
 
 def refusal(**changes):
     """The error that the paper's vehicle with some fields changed is refused with."""
@@ -21,15 +19,52 @@ def refusal(**changes):
     return text
 
 
-def test_three_vehicles_ship():
-    assert vehicle_names() == ["crazyflie", "crazyflie-km794", "crazyflie-measured"]
+def test_ten_vehicles_ship():
+    crazyflies = [f"crazyflie{end}" for end in ("", "-b500", "-km794", "-l250", "-measured", "-p250", "-t350")]
+    assert vehicle_names() == [*crazyflies, "hummingbird", "racer", "x500"]
+
+
+@pytest.mark.parametrize("name", sorted(set(vehicle_names()) - {"crazyflie", "crazyflie-km794"}))
+def test_full_action_is_full_thrust(name):
+    # the papers' two fly with the paper's action scale (R9); the others to what their motors give
+    vehicle = load_vehicle(name)
+    full = vehicle.square_of_speed(vehicle.hover_rotor_speed_rpm * (1 + vehicle.action_scale)) / vehicle.hover_square
+    motors = vehicle.square_of_speed(vehicle.top_rotor_speed_rpm) / vehicle.hover_square
+    assert full == pytest.approx(motors, rel=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("name", "thrust", "lag"),
+    [
+        # thrust_max over m g / 4; rotor_dyn_coef [a, b, c, d]: 1 / (a + 2 b n), 1 / (c + 2 d n) at hover
+        ("crazyflie-l250", 4 * 0.12 / (0.0319 * 9.81), (1 / 7.355624, 1 / (2 * 2.444386e-4 * 18967.8))),
+        (
+            "crazyflie-p250",
+            4 * 0.12 / (0.0318 * 9.81),
+            (1 / (5.172597 + 2 * 8.147742e-5 * 23191.8), 1 / (2 * 2.095253e-4 * 23191.8)),
+        ),
+        ("crazyflie-t350", 4 * 0.18 / (0.0379 * 9.81), (1 / 11.374753, 1 / (2 * 3.786769e-4 * 19041.0))),
+        (
+            "crazyflie-b500",
+            4 * 0.2 / (0.04338 * 9.81),
+            (1 / (13.996002 + 2 * 1.109321e-4 * 15896.3), 1 / (5.933169 + 2 * 3.195131e-4 * 15896.3)),
+        ),
+        ("racer", 4 * 8.5 / (0.752 * 9.81), (0.033, 0.033)),
+        ("hummingbird", 4 * 5.57e-6 * 838**2 / (0.5 * 9.81), (0.0125, 0.025)),
+        ("x500", 4 * 8.54858e-6 * 1000**2 / (2.0643077 * 9.81), (0.0125, 0.025)),
+    ],
+)
+def test_thrust_to_weight_and_lag_are_those_of_the_published_numbers(name, thrust, lag):
+    vehicle = load_vehicle(name)
+    assert vehicle.full_thrust_to_weight == pytest.approx(thrust, rel=1e-3)
+    assert (vehicle.motor_rise_time_constant, vehicle.motor_fall_time_constant) == pytest.approx(lag, rel=1e-3)
 
 
 @pytest.mark.parametrize("name", vehicle_names())
 def test_a_shipped_vehicle_has_a_source_for_every_number(name):
     vehicle = load_vehicle(name)
     assert vehicle.name == name
-    assert sorted(vehicle.sources) == sorted(NUMBERS)
+    assert sorted(vehicle.sources) == sorted(vehicle_table(name).keys() - {"name", "sources"})
     assert all(vehicle.sources.values())
 
 
@@ -63,13 +98,13 @@ def test_the_paper_hovers_at_about_16004_rpm():
 
 def test_the_paper_flies_with_a_thrust_to_weight_of_2_25_and_the_measured_vehicle_with_1_48():
     # paper: (1 + 1/2)^2; measured: 4 * 0.12 N / (0.033 kg * 9.81 m/s^2) = 0.48 / 0.32373 = 1.4827 (C7)
-    assert load_vehicle("crazyflie").thrust_to_weight == pytest.approx(2.25)
-    assert load_vehicle("crazyflie-measured").thrust_to_weight == pytest.approx(1.4827, abs=1e-3)
+    assert load_vehicle("crazyflie").full_thrust_to_weight == pytest.approx(2.25)
+    assert load_vehicle("crazyflie-measured").full_thrust_to_weight == pytest.approx(1.4827, abs=1e-3)
 
 
 def test_a_motor_limit_lowers_the_thrust_to_weight():
     limited = dataclasses.replace(load_vehicle("crazyflie"), maximum_rotor_speed_rpm=16_003.6 * 1.2)
-    assert limited.thrust_to_weight == pytest.approx(1.44, abs=1e-4)
+    assert limited.full_thrust_to_weight == pytest.approx(1.44, abs=1e-4)
 
 
 def test_the_lever_is_the_arm_over_root_two():

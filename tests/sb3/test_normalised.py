@@ -104,6 +104,23 @@ def test_without_statistics_it_is_refused_and_each_remedy_of_the_message_helps(f
         np.testing.assert_allclose(act(found.controller), wanted(made, "scaled"), rtol=0, atol=1e-4)
 
 
+def test_the_message_is_true_about_where_statistics_were_looked_for(folder, made):
+    place = folder(m__zip="scaled.zip", untrained__zip="untrained.zip")
+
+    def said(model):
+        with pytest.raises(BadInput) as caught:
+            load_sb3(place / model)
+        return str(caught.value)
+
+    assert "There is no vecnormalize.pkl beside the model, nor in a folder there." in said("m.zip")
+    for name in ("one", "two"):
+        (place / name).mkdir()
+        shutil.copyfile(made / "scaled.pkl", place / name / "vecnormalize.pkl")
+        if name == "one":
+            assert f"{place / 'one' / 'vecnormalize.pkl'} may belong to it" in said("untrained.zip")
+    assert "Several may belong to it: one/vecnormalize.pkl, two/vecnormalize.pkl." in said("m.zip")
+
+
 def test_models_of_raw_observations_are_not_taken_for_scaled_ones(folder):
     for name in ("raw.zip", "rewards.zip", "untrained.zip"):
         assert "observations" not in load_sb3(folder(m__zip=name) / "m.zip").about

@@ -6,10 +6,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 from tests.layouts import LAYOUTS, with_layout
+from tests.odd_vehicles import ODD, odd_vehicle
 
 import flytune
 from flytune.control.classical import CLASSICAL, classical_controller
 from flytune.physics.dynamics import CONTROL_PERIOD
+from flytune.physics.rotors import hover_action
 from flytune.physics.vehicle import load_vehicle
 from flytune.simulation.simulator import VehicleStates, to_body, to_inertial
 from flytune.simulation.simulators import make_simulator
@@ -209,10 +211,11 @@ def test_a_classical_controller_brings_a_vehicle_with_its_rotors_elsewhere_to_th
     assert not flights.crashed.any() and error.max() < 0.05
 
 
-@pytest.mark.parametrize("vehicle", ["paper", "measured"])
+@pytest.mark.parametrize("vehicle", ["paper", "measured", "everything"])
 def test_a_simulator_comes_to_flytunes_physics_as_its_step_shrinks(name, vehicle, request):
-    vehicle = request.getfixturevalue(vehicle)
-    actions = np.random.default_rng(6).uniform(-0.4, 0.4, (30, 6, 4))
+    vehicle = odd_vehicle(vehicle) if vehicle in ODD else request.getfixturevalue(vehicle)
+    steps = round(0.3 * vehicle.control_rate)
+    actions = float(hover_action(vehicle)) + np.random.default_rng(6).uniform(-0.4, 0.4, (steps, 6, 4))
     start = moving(vehicle)
     own = fly("flytune", vehicle, start, actions)
     coarse, fine = (difference(fly(name, vehicle, start, actions, physics_steps=steps), own) for steps in (10, 20))

@@ -1,7 +1,6 @@
 """Episodes: reset, observe, step and restart, for every preset and vehicle (paper R7 to R15)."""
 
 import dataclasses
-import itertools
 import math
 
 import jax
@@ -18,7 +17,10 @@ from flytune.task.reward import rewards
 from flytune.task.situation import situation
 from flytune.task.termination import SAFE, causes, margins
 
-EVERY = list(itertools.product(preset_names(), vehicle_names()))
+# each preset, and each vehicle: a program of its own takes seconds to compile, so not each with each
+EVERY = [(preset, "crazyflie") for preset in preset_names()] + [
+    ("baseline", vehicle) for vehicle in vehicle_names() if vehicle != "crazyflie"
+]
 ACTION = (0.3, -0.2, 0.1, -0.4)
 
 

@@ -31,7 +31,8 @@ def test_mujoco_reads_the_vehicles_numbers_from_the_mjcf(model, odd):
     np.testing.assert_array_equal(model.body_iquat[1], [1, 0, 0, 0])
     np.testing.assert_array_equal(model.opt.gravity, [0, 0, -odd.gravity])
     lever = odd.arm / math.sqrt(2)
-    np.testing.assert_allclose(model.site_pos, lever * np.array([[1, -1, 0], [-1, -1, 0], [-1, 1, 0], [1, 1, 0]]))
+    np.testing.assert_array_equal(model.site("centre").pos, [0, 0, 0])
+    np.testing.assert_allclose(model.site_pos[1:], lever * np.array([[1, -1, 0], [-1, -1, 0], [-1, 1, 0], [1, 1, 0]]))
 
 
 def test_the_file_says_how_it_is_stepped(model):

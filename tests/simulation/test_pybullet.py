@@ -88,7 +88,7 @@ def test_rotor_drag_slows_a_flight_along_its_way(paper):
 
 @pytest.mark.parametrize("effect", ["rotor_drag", "ground_effect"])
 def test_an_effect_is_refused_for_a_vehicle_that_does_not_say_its_coefficient(paper, effect):
-    other = dataclasses.replace(paper, name="hummingbird", **{effect: None})
+    other = dataclasses.replace(paper, name="hummingbird", optional_rotor_drag=None, ground_effect=None)
     with pytest.raises(
         BadInput, match=f"^world pybullet: {effect}=true is not possible, since the vehicle hummingbird"
     ):

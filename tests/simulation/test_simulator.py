@@ -15,7 +15,7 @@ from flytune.errors import BadInput
 from flytune.physics import dynamics
 from flytune.physics.vehicle import load_vehicle
 from flytune.simulation.actuator import Actuator
-from flytune.simulation.aerodynamics import LARGEST_GROUND_EFFECT, ground_effect, rotor_drag
+from flytune.simulation.aerodynamics import LARGEST_GROUND_EFFECT, drag, ground_effect
 from flytune.simulation.simulator import VehicleStates, rotation_matrix, to_body, to_inertial
 from flytune.simulation.simulators import SIMULATORS, make_simulator
 
@@ -178,15 +178,15 @@ def test_the_lower_propellers_of_a_tilted_vehicle_gain_more_and_those_on_its_bac
 
 
 def test_rotor_drag_opposes_motion_along_the_bodys_axes_and_grows_with_rotor_speed(paper, attitudes):
+    windy = dataclasses.replace(paper, rotor_drag=paper.optional_rotor_drag)
     rpm = np.full((20, 4), 15_000.0)
     turning = 4 * 15_000 * 2 * math.pi / 60  # rad/s
     for axis, coefficient in enumerate((9.1785e-7, 9.1785e-7, 10.311e-7)):
         velocity = 0.5 * rotation_matrix(attitudes)[:, :, axis]  # 0.5 m/s along one axis of each body
-        np.testing.assert_allclose(
-            rotor_drag(paper, attitudes, velocity, rpm), -coefficient * turning * velocity, atol=1e-15
-        )
+        force = to_inertial(attitudes, drag(windy, attitudes, velocity, rpm))
+        np.testing.assert_allclose(force, -coefficient * turning * velocity, atol=1e-15)
     np.testing.assert_allclose(
-        rotor_drag(paper, attitudes, velocity, 2 * rpm), 2 * rotor_drag(paper, attitudes, velocity, rpm), rtol=1e-12
+        drag(windy, attitudes, velocity, 2 * rpm), 2 * drag(windy, attitudes, velocity, rpm), rtol=1e-12
     )
 
 
@@ -195,11 +195,12 @@ def test_each_vehicle_has_its_own_air(paper, attitudes):
     velocity, rpm = np.tile([1.0, 2.0, 3.0], (20, 1)), np.full((20, 4), 15_000.0)
     high = np.array([[0.0, 0.0, 1.0]])
     for factor in (0, 10):
+        windy = dataclasses.replace(paper, rotor_drag=paper.optional_rotor_drag)
         other = dataclasses.replace(
-            paper, rotor_drag=tuple(factor * each for each in paper.rotor_drag), ground_effect=factor * 11.36859
+            paper, rotor_drag=tuple(factor * each for each in windy.rotor_drag), ground_effect=factor * 11.36859
         )
-        force = factor * rotor_drag(paper, attitudes, velocity, rpm)
-        np.testing.assert_allclose(rotor_drag(other, attitudes, velocity, rpm), force, rtol=1e-12, atol=1e-15)
+        force = factor * drag(windy, attitudes, velocity, rpm)
+        np.testing.assert_allclose(drag(other, attitudes, velocity, rpm), force, rtol=1e-12, atol=1e-15)
         gain = factor * ground_effect(paper, high, attitudes[:1])
         np.testing.assert_allclose(ground_effect(other, high, attitudes[:1]), gain, rtol=1e-12, atol=1e-15)
 

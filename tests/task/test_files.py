@@ -15,7 +15,7 @@ from flytune.task.files import load_task, read_task_text, write_task
 def folder(tmp_path):
     """A folder with a vehicle, a task that flies it, and one below that is based on the task."""
     (tmp_path / "below").mkdir()
-    (tmp_path / "mine.toml").write_text(document.write(airframe("x500")).replace('name = "x500"\n', ""))
+    (tmp_path / "mine.toml").write_text(document.write(airframe("x500 base")).replace('name = "x500 base"\n', ""))
     write(tmp_path / "task.toml", 'based_on = "baseline"\nvehicle = "mine.toml"\n[reward.velocity]\nweight = 0.2')
     write(tmp_path / "below" / "child.toml", 'based_on = "../task.toml"\n[termination.speed]\nbound = 1.5')
     return tmp_path
@@ -42,7 +42,9 @@ def refusal(task, edits=None):
 def test_a_vehicle_lies_beside_the_file_that_names_it_whatever_the_current_folder(folder, monkeypatch, where):
     monkeypatch.chdir(folder / where)
     for task in (folder / "task.toml", os.path.relpath(folder / "task.toml")):
-        assert load_task(task).vehicle == airframe("x500").__class__(**{**vars(airframe("x500")), "name": "mine"})
+        assert load_task(task).vehicle == airframe("x500 base").__class__(
+            **{**vars(airframe("x500 base")), "name": "mine"}
+        )
 
 
 def test_a_file_may_be_based_on_another_file(folder, monkeypatch):
@@ -126,11 +128,11 @@ def test_a_file_may_change_one_number_of_the_vehicle_of_its_base(tmp_path):
 
 
 def test_a_complete_vehicle_keeps_nothing_of_the_base(tmp_path):
-    table = document.plain(airframe("hummingbird")) | {"sources": {}}
+    table = document.plain(airframe("hummingbird x")) | {"sources": {}}
     text = "\n".join(f"{name} = {value!r}".replace("'", '"') for name, value in table.items() if name != "sources")
     task = load_task(write(tmp_path / "mine.toml", f'based_on = "baseline"\n[vehicle]\n{text}'))
     assert task.vehicle.name == "hummingbird"
-    assert task.vehicle.rotor_drag is None and task.vehicle.ground_effect is None
+    assert task.vehicle.optional_rotor_drag is None and task.vehicle.ground_effect is None
 
 
 def test_a_layout_of_rotors_takes_the_place_of_the_arm(tmp_path):
@@ -184,7 +186,7 @@ def test_dials_formulas_and_inputs_are_removed_likewise(edits, gone):
 
 
 def test_an_optional_number_of_a_vehicle_is_removed_likewise():
-    assert load_task("baseline", {"vehicle.rotor_drag": "none"}).vehicle.rotor_drag is None
+    assert load_task("baseline", {"vehicle.optional_rotor_drag": "none"}).vehicle.optional_rotor_drag is None
 
 
 @pytest.mark.parametrize(

@@ -242,7 +242,11 @@ def test_an_unknown_key_is_refused_with_the_nearest_one():
         ({"vehicle__mass": 0.0}, "vehicle.mass: 0.0 is not allowed. Allowed: above 0 kg."),
         ({"vehicle__maximum_rotor_speed_rpm": 100.0}, "vehicle.maximum_rotor_speed_rpm: 100.0 cannot lift"),
         ({"vehicle": "crazyfly"}, "vehicle: 'crazyfly' is no vehicle."),
-        ({"vehicle": 3}, "vehicle: 3 is not allowed. Allowed: a table"),
+        ({"vehicle": 3}, "vehicle: 3 is not allowed for a table. Give one of crazyflie, "),
+        (
+            {"termination__speed": 3},
+            "termination.speed: 3 is not allowed for a table. Edit what is in it: termination.",
+        ),
         ({"ppo__minibatch": 100}, "ppo.minibatch: 100 does not divide environments * rollout = 16384."),
         ({"target__yaw": 180.0}, "target.yaw: 180.0 is not allowed. Allowed: -6.28"),
         (

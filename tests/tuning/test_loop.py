@@ -14,7 +14,7 @@ from flytune.runs.find import find_controller
 from flytune.task.files import load_task
 from flytune.tuning.asked import make_requirement
 from flytune.tuning.rules import Rule, load_rules
-from flytune.tuning.tune import tune
+from flytune.tuning.tune import directory_name, tune
 
 RULES = load_rules()
 
@@ -205,3 +205,21 @@ def _known(name):
 
 def _weights(directory):
     return load_policy(directory / "policy.safetensors").actor.weights
+
+
+@pytest.mark.parametrize(
+    ("task", "edits", "name"),
+    [
+        (None, {}, "tune-2.5s"),
+        (None, {"reward.velocity.weight": 0.2}, "tune-2.5s"),
+        ("acrobatic-refined", {}, "tune-acrobatic-refined-2.5s"),
+        (None, {"vehicle": "crazyflie-measured"}, "tune-crazyflie-measured-2.5s"),
+        ("mine.toml", {}, "tune-mine-crazyflie-km794-2.5s"),
+    ],
+)
+def test_the_directory_of_a_tuning_says_task_and_vehicle_where_they_are_not_the_usual_ones(
+    tmp_path, monkeypatch, task, edits, name
+):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "mine.toml").write_text('based_on = "baseline"\nvehicle = "crazyflie-km794"\n')
+    assert directory_name(make_requirement(2.5), task, edits) == name

@@ -77,6 +77,26 @@ def test_an_iteration_is_told_beside_the_one_before_and_the_prediction():
     )
 
 
+def test_every_axis_that_is_asked_for_is_told_and_the_note_stands_behind_the_one_that_counts():
+    wanted = make_requirement(6.0, axis=["position", "yaw"])
+    each = {
+        "settling_time": {"position": 5.9, "yaw": 7.42},
+        "overshoot": {"position": 0.01, "yaw": 0.0},
+        "error": {"position": 0.0013, "yaw": math.radians(0.5)},
+    }
+    response = dataclasses.replace(AFTER, axes={"settling_time": "yaw"}, each=each)
+    assert describe(response, wanted, {"settling_time": " (was 8.00 s)"}) == (
+        "settles in 5.90 s (position), 7.42 s (yaw) (was 8.00 s), overshoot 1.0 % (position), 0.0 % (yaw), error "
+        "1.30 mm (position), 0.50 deg (yaw), 100.0 % settled"
+    )
+    never = {"position": 5.9, "yaw": math.inf}
+    response = dataclasses.replace(response, settling_time=math.inf, each={**each, "settling_time": never})
+    assert describe(response, wanted).startswith("settles in 5.90 s (position), never (yaw), ")
+    never = {"position": math.inf, "yaw": math.inf}
+    response = dataclasses.replace(response, each={**each, "settling_time": never})
+    assert describe(response, wanted).startswith("does not settle, ")
+
+
 def test_constraints_of_the_user_are_always_told():
     assert describe(AFTER, WANTED, bounds=True).endswith("100.0 % settled, your constraints are satisfied in 100.0 %")
 

@@ -1,6 +1,7 @@
 """Requirements: numbers that are refused, measures of a judgement, and misses."""
 
 import dataclasses
+import json
 import math
 
 import numpy as np
@@ -74,6 +75,9 @@ def test_of_several_axes_the_one_that_misses_its_bound_most_is_measured(pid_flig
     both = make_requirement(3, axis=["position", "yaw"])
     response = both.measure(judged)
     assert (response.settling_time, response.axes) == (alone["position"].settling_time, {})
+    told = {axis: each.settling_time for axis, each in alone.items()}  # of each axis, whatever the worst one is
+    assert response.each["settling_time"] == told and set(response.each) == {"settling_time", "overshoot", "error"}
+    assert alone["yaw"].each == {}
     # the yaw turns past its target, and the bound of it is what is missed
     turning = dataclasses.replace(judged, overshoot={**judged.overshoot, "yaw": np.full(40, 0.2)})
     response = both.measure(turning)
@@ -89,6 +93,10 @@ def test_of_several_axes_the_one_that_misses_its_bound_most_is_measured(pid_flig
     never = np.where(np.arange(40) < 10, np.inf, judged.settling_time["yaw"])
     lost = dataclasses.replace(judged, settling_time={**judged.settling_time, "yaw": never})
     assert both.measure(lost).settled == pytest.approx(0.75)
+    nobody = dataclasses.replace(judged, settling_time={**judged.settling_time, "yaw": np.full(40, np.inf)})
+    response = both.measure(nobody)
+    assert response.to_dict()["each"]["settling_time"]["yaw"] is None
+    assert ResponseSummary.from_dict(json.loads(json.dumps(response.to_dict()))) == response
 
 
 @pytest.mark.parametrize(

@@ -1,6 +1,7 @@
 """The parts that flytune's environments share (Gymnasium's and Stable-Baselines3's): task, spaces, starts, pictures."""
 
 import dataclasses
+import math
 from collections import deque
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -10,13 +11,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from flytune.errors import BadInput, require
-from flytune.physics.dynamics import CONTROL_PERIOD, hovering
+from flytune.physics.dynamics import hovering
 from flytune.physics.rotation import from_euler
 from flytune.simulation.host import HostEnvironment, episodes_at
 from flytune.simulation.simulator import VehicleStates, state_numbers
 from flytune.task.agreement import check_starts
 from flytune.task.files import load_task
-from flytune.task.observation import SIZE
+from flytune.task.observation import RATE, SIZE
 from flytune.task.target import target_at
 from flytune.task.task import Task
 
@@ -25,7 +26,7 @@ if TYPE_CHECKING:
 else:
     gymnasium = require("gymnasium", "gymnasium")  # a missing one in one line
 
-METADATA = {"render_modes": ["rgb_array"], "render_fps": round(1 / CONTROL_PERIOD)}
+METADATA = {"render_modes": ["rgb_array"], "render_fps": RATE}
 TRAIL = 300  # steps of the way behind a vehicle that a picture shows
 FARTHEST = 1000.0  # m, also rad: of a start given by hand
 
@@ -42,7 +43,8 @@ def read_task(task: str | Path | Task, edits: dict[str, Any] | None, max_episode
                 f"max_episode_steps: {max_episode_steps!r} is not allowed. Allowed: a whole number, 1 or more."
             )
         whole = read_task(task, edits)
-        return dataclasses.replace(whole, horizon=min(int(whole.horizon), int(max_episode_steps)))
+        wanted = math.ceil(max_episode_steps * RATE / whole.vehicle.control_rate)
+        return dataclasses.replace(whole, horizon=min(int(whole.horizon), wanted))
     if isinstance(task, Task) and edits:
         raise BadInput(
             "edits: a Task cannot be edited here. Allowed: edits of a preset or a file. Edit the Task itself."
@@ -203,10 +205,10 @@ def _picture(task: Task, numbers: np.ndarray, trail: np.ndarray, steps: int, rew
     from flytune.adapters import picture  # here, because it needs Pillow
 
     state = VehicleStates.from_rows(np.nan_to_num(numbers).astype(float))
-    target = target_at(task.target, steps * CONTROL_PERIOD)
+    target = target_at(task.target, steps * task.vehicle.control_period)
     distance = np.linalg.norm(numbers[:3] - np.array(target.position, float))
     lines = (
-        ("time", f"{steps * CONTROL_PERIOD:.2f} s"),
+        ("time", f"{steps * task.vehicle.control_period:.2f} s"),
         ("distance", f"{distance:.3f} m"),
         ("speed", f"{np.linalg.norm(state.velocity):.2f} m/s"),
         ("reward", f"{reward:.3f}"),

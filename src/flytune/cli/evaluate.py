@@ -18,7 +18,7 @@ from flytune.cli.options import (
     check_flights,
     check_folder,
 )
-from flytune.config.files import check_file, make_folder, write_json
+from flytune.config.files import check_file, check_suffix, make_folder, write_json
 from flytune.errors import BadInput
 
 FlightsFile = Annotated[Path | None, Parameter(name="--flights", metavar="FILE.npz")]
@@ -80,6 +80,8 @@ def compare(
     if out is not None and out.exists():
         check_file(out / "comparison.json", mark=b'"differences": [', kind="a comparison")
         check_file(out / "comparison.html", mark=page_mark("report.html"), kind="a page of controllers")
+    if flights is not None:  # before it gets numbers, so that the message has the name that was typed
+        check_suffix(flights, "flights", "a file of flights", [".npz"])
     numbered = (
         []
         if flights is None
@@ -102,14 +104,16 @@ def report(
     /,
     *,
     options: FlightOptions = FLIGHT_DEFAULTS,
-    out: Annotated[Path, Parameter(metavar="FILE", help="the page")] = Path("report.html"),
+    out: Annotated[Path, Parameter(metavar="FILE", help="the page, or a folder for report.html")] = Path("report.html"),
 ) -> None:
     """Print the tables of one or more controllers, and write one self-contained HTML page."""
     from flytune.evaluation.evaluate import evaluate_all
     from flytune.report.page import page_mark
     from flytune.report.report import write_report
 
-    check_file(out, mark=page_mark("report.html"), kind="a page of controllers")
+    if os.path.isdir(out):
+        out = out / "report.html"
+    check_file(out, mark=page_mark("report.html"), kind="a page of controllers", suffixes=[".html", ".htm"])
     evaluations = evaluate_all(controllers, **_one_task(controllers, options))
     print("\n\n".join(evaluation.judgement.table() for evaluation in evaluations), end="\n\n")
     write_report(out, evaluations)

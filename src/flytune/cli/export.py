@@ -5,6 +5,7 @@ from typing import Annotated, Literal
 
 from cyclopts import Parameter
 
+from flytune.cli.completion import controllers
 from flytune.config.files import check_file
 
 PolicyName = Annotated[
@@ -13,6 +14,7 @@ PolicyName = Annotated[
         name="CONTROLLER",
         help="a run directory, a policy file (.safetensors, .onnx, .zip), or a policy that ships; with a setting of "
         "its dials (dial@speed=0.5), the policy of this setting alone",
+        completer=controllers,
     ),
 ]
 Format = Annotated[
@@ -29,7 +31,8 @@ def export(controller: PolicyName, /, *, file_format: Format, out: File) -> None
     from flytune.export.onnx import FORMAT_VALUE as ONNX
     from flytune.runs.find import find_controller, split_setting
 
-    check_file(out, mark={"onnx": ONNX, "safetensors": SAFETENSORS}[file_format].encode(), kind="a policy")
+    mark = {"onnx": ONNX, "safetensors": SAFETENSORS}[file_format].encode()
+    check_file(out, mark=mark, kind="a policy", suffixes=[f".{file_format}"])
     found = find_controller(controller)
     _, setting = split_setting(controller)
     print(export_policy(found.fixed() if setting else found, out, file_format))

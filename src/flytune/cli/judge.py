@@ -7,6 +7,7 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
+from flytune.cli.completion import columns as quantities
 from flytune.cli.options import AsJson, Assignments, Real
 from flytune.errors import BadInput
 
@@ -29,6 +30,7 @@ def judge(
         Parameter(
             name="--columns",
             metavar="NAME=COLUMN",
+            completer=quantities,
             help="the columns of a log: time=stamp[ms] x=pos_n[mm] z=-down yaw=0 ...; NAME is one of time, x, y, z, "
             "yaw, qx, qy, qz, qw, vx, vy, vz, target_x, target_y, target_z, target_yaw, trial (default: found by their "
             "names)",
@@ -83,7 +85,14 @@ def _columns(texts: tuple[str, ...]) -> dict[str, str]:
 
 
 def _target(text: str) -> list[float]:
+    """The numbers of a text such as 0,0,1,0 or "[0, 0, 1, 0]"."""
     try:
-        return [float(part) for part in text.split(",")]
+        numbers = [float(part) for part in text.strip("[]() ").replace(",", " ").split()]
     except ValueError:
-        raise BadInput(f"target: {text!r} is not allowed. Allowed: four numbers x,y,z,yaw in m and rad.") from None
+        numbers = []
+    if len(numbers) != 4:
+        raise BadInput(
+            f"target: {text!r} is not allowed. Allowed: four numbers x,y,z,yaw in m and rad, with commas between them: "
+            "--target 0,0,1,0."
+        )
+    return numbers

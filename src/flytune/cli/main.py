@@ -10,7 +10,8 @@ from typing import Annotated, Literal
 from cyclopts import App, CycloptsError, Parameter
 
 import flytune
-from flytune.cli import bench, evaluate, export, judge, reproduce, response_map, rules, show, train, tune
+from flytune.cli import bench, evaluate, export, judge, reproduce, response_map, rules, show, train, tune, vehicle
+from flytune.cli.completion import script
 from flytune.cli.refusal import refusal
 from flytune.errors import BadInput, FlytuneError, check_installed
 
@@ -28,6 +29,7 @@ COMMANDS = (
     export.export,
     show.list,
     show.show,
+    vehicle.vehicle,
     bench.bench,
 )
 Shell = Annotated[Literal["bash", "zsh", "fish"], Parameter(name="SHELL", help="the shell that shall complete")]
@@ -48,8 +50,8 @@ def make_app() -> App:
     )
 
     def completion(shell: Shell, /) -> None:
-        """Print a script that completes commands and options. In bash: source <(flytune completion bash)"""
-        print(app.generate_completion(prog_name="flytune", shell=shell))
+        """Print a script that completes what is typed. In bash: source <(flytune completion bash)"""
+        print(script(app, shell))
 
     for number, command in enumerate((*COMMANDS, completion)):
         app.command(command, sort_key=number, help_epilogue="")

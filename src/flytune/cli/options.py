@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from cyclopts import Parameter, Token
 
+from flytune.cli.completion import completed_by, controllers, edits, tasks
 from flytune.config.files import check_file
 from flytune.errors import BadInput
 from flytune.training.trainer import trainer_names
@@ -22,7 +23,25 @@ CONTROLLER_HELP = (
 )
 
 
-def number_reader(kind: type, allowed: str) -> Callable[[type, Sequence[Token]], Any]:
+def whole_number(text: str) -> int:
+    """The whole number of a text, which may be written as a float: 1e6, 100.0.
+
+    Raises:
+        ValueError: it is none.
+    """
+    try:
+        return int(text)
+    except ValueError:
+        number = float(text)
+        if not number.is_integer():
+            raise
+        return int(number)
+
+
+FILES = (".html", ".htm", ".json", ".jsonl", ".npz", ".csv", ".onnx", ".safetensors", ".zip", ".toml")  # no folders
+
+
+def number_reader(kind: Callable[[str], float], allowed: str) -> Callable[[type, Sequence[Token]], Any]:
     """A converter for options that are numbers: 3.7 is no whole number, and is refused instead of rounded."""
 
     def read(_: type, tokens: Sequence[Token]) -> Any:
@@ -40,17 +59,17 @@ else:
     TrainerName = Literal[trainer_names()]
     EveryTaskTrainerName = Literal[trainer_names(every_task=True)]
 
-Task = Annotated[str, Parameter(name="TASK", help=TASK_HELP)]
-Controller = Annotated[str, Parameter(name="CONTROLLER", help=CONTROLLER_HELP)]
-Controllers = Annotated[tuple[str, ...], Parameter(name="CONTROLLER", help=CONTROLLER_HELP)]
-Whole = Annotated[int, Parameter(metavar="N", converter=number_reader(int, "a whole number"))]
+Task = Annotated[str, Parameter(name="TASK", help=TASK_HELP), completed_by(tasks)]
+Controller = Annotated[str, Parameter(name="CONTROLLER", help=CONTROLLER_HELP), completed_by(controllers)]
+Controllers = Annotated[tuple[str, ...], Parameter(name="CONTROLLER", help=CONTROLLER_HELP), completed_by(controllers)]
+Whole = Annotated[int, Parameter(metavar="N", converter=number_reader(whole_number, "a whole number"))]
 Real = Annotated[float, Parameter(converter=number_reader(float, "a number"))]
 Flag = Annotated[bool, Parameter(negative=(), show_default=False)]
 Assignments = Annotated[
     tuple[str, ...], Parameter(metavar="PATH=VALUE", consume_multiple=(1, None), negative=(), show_default=False)
 ]
 Folder = Annotated[Path | None, Parameter(name="--out", metavar="DIR")]
-Edits = Annotated[Assignments, Parameter(name="--set")]
+Edits = Annotated[Assignments, Parameter(name="--set"), completed_by(edits)]
 AsJson = Annotated[Flag, Parameter(name="--json", help="print one JSON object instead, and messages to standard error")]
 
 
@@ -65,6 +84,7 @@ class FlightOptions:
             metavar="TASK",
             help=f"the task to fly: {TASK_HELP} (default: the one it was trained for; of several controllers, that of "
             "the first learned policy)",
+            completer=tasks,
         ),
     ] = None
     simulator: Annotated[
@@ -101,9 +121,19 @@ class FlightOptions:
         ),
     ] = ()
 
+    changes: Annotated[
+        Assignments,
+        Parameter(
+            name="--set",
+            help="what the controller meets in place of what it was told, of the vehicle or the noise: "
+            "vehicle.mass=0.036 ...",
+        ),
+        completed_by(edits),
+    ] = ()
+
     def settings(self) -> dict[str, Any]:
         """The keyword arguments of `flytune.evaluate`."""
-        read = {name: assignments(getattr(self, name)) for name in ("simulator_options", "dial")}
+        read = {name: assignments(getattr(self, name)) for name in ("simulator_options", "dial", "changes")}
         return vars(self) | read
 
 
@@ -125,8 +155,9 @@ def check_folder(folder: Path | None, controller: str = "") -> None:
     """Refuse a folder that cannot be written, or that holds the run of another controller, before anything flies.
 
     Raises:
-        BadInput: it is a file, or another run.
+        BadInput: it is a file, has the name of one, or is another run.
     """
+    check_folder_name(folder)
     if folder is None or not os.path.exists(folder):
         return
     if not os.path.isdir(folder):
@@ -134,6 +165,19 @@ def check_folder(folder: Path | None, controller: str = "") -> None:
     own = os.path.isdir(controller) and os.path.samefile(folder, controller)
     if not own and os.path.exists(folder / "run.json"):
         raise BadInput(f"out: {folder} is the run directory of another training. Give another folder.")
+
+
+def check_folder_name(folder: Path | None) -> None:
+    """Refuse a new folder with the name of a file that flytune writes.
+
+    Raises:
+        BadInput: its name is one.
+    """
+    if folder is not None and folder.suffix in FILES and not os.path.exists(folder):
+        raise BadInput(
+            f"out: {folder} is the name of a file. Allowed: a folder, which may be new. Did you mean "
+            f"{folder.with_suffix('')}?"
+        )
 
 
 def check_flights(*files: Path) -> None:
@@ -145,4 +189,4 @@ def check_flights(*files: Path) -> None:
     from flytune.evaluation.flights import MARK
 
     for file in files:
-        check_file(file, "flights", mark=MARK, kind="a file of flights")
+        check_file(file, "flights", mark=MARK, kind="a file of flights", suffixes=[".npz"])

@@ -5,7 +5,7 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
-from flytune.cli.options import AsJson, EveryTaskTrainerName, Flag, Folder, Whole
+from flytune.cli.options import AsJson, EveryTaskTrainerName, Flag, Folder, Whole, check_folder_name
 
 
 def reproduce(
@@ -30,6 +30,7 @@ def reproduce(
     from flytune.reproduction.study import BEHAVIOURS
     from flytune.reproduction.trainings import show_trainings
 
+    check_folder_name(out)
     with show_trainings(seeds * len(BEHAVIOURS)) as (on_progress, on_message):
         result = reproduce(
             out, trainer=trainer, seeds=seeds, steps=steps, refined=refined,

@@ -8,7 +8,8 @@ from typing import Annotated, Any
 
 from cyclopts import Parameter
 
-from flytune.cli.options import AsJson, Edits, Flag, Folder, Task, TrainerName, Whole, assignments
+from flytune.cli.completion import controllers
+from flytune.cli.options import AsJson, Edits, Flag, Folder, Task, TrainerName, Whole, assignments, check_folder_name
 from flytune.errors import BadInput
 from flytune.training.trainer import DEFAULT_TRAINER, TRAINERS, find_trainer
 
@@ -34,6 +35,7 @@ def train(
         Parameter(
             name="--from",
             metavar="CONTROLLER",
+            completer=controllers,
             help="go on from a policy in a new run, for instance with another vehicle or other weights: a run "
             "directory, a policy file, or a policy that ships. A run of ppo also gives its critic to ppo; else the "
             "critic is new",
@@ -53,6 +55,7 @@ def train(
     from flytune.training.loop import train
     from flytune.training.progress import show_progress
 
+    check_folder_name(out)
     changes = assignments(edits)
     find_trainer(trainer).check_edits(changes)
     wanted = load_task(task, changes)

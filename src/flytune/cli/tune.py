@@ -9,7 +9,18 @@ from typing import Annotated, Any, Literal
 
 from cyclopts import Parameter
 
-from flytune.cli.options import AsJson, Edits, EveryTaskTrainerName, Flag, Folder, Real, Whole, assignments
+from flytune.cli.completion import tasks
+from flytune.cli.options import (
+    AsJson,
+    Edits,
+    EveryTaskTrainerName,
+    Flag,
+    Folder,
+    Real,
+    Whole,
+    assignments,
+    check_folder_name,
+)
 from flytune.errors import BadInput, Unmet
 from flytune.training.trainer import DEFAULT_TRAINER, trainer_names
 
@@ -43,6 +54,7 @@ class TuneOptions:
         Parameter(
             consume_multiple=(1, None),
             negative=(),
+            show_default=", ".join,
             help="the axis whose response counts; or several: the first one settles in the time asked for, the others "
             "settle no later",
         ),
@@ -104,6 +116,7 @@ TuneTask = Annotated[
     Parameter(
         name="TASK",
         help="the task to begin with, a preset or a TOML file (default: the known task that settles nearest)",
+        completer=tasks,
     ),
 ]
 
@@ -113,6 +126,7 @@ def tune(task: TuneTask = None, /, *, options: TuneOptions, as_json: AsJson = Fa
     from flytune.training.progress import show_progress
     from flytune.tuning.tune import tune
 
+    check_folder_name(options.out)
     with show_progress() as on_progress:
         result = tune(
             **options.arguments(),

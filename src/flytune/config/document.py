@@ -5,6 +5,7 @@
 
 import dataclasses
 import functools
+import re
 import tomllib
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -19,7 +20,9 @@ from flytune.config.fields import (
     Whole,
     allowed,
     annotations,
+    is_optional,
     is_union,
+    list_like,
     nearest,
     reason,
     slip,
@@ -73,8 +76,14 @@ def parse(text: str, where: str) -> dict[str, Any]:
         raise BadInput(f"{where}: is not valid TOML: {error}.") from None
 
 
-def read(kind: type[T], data: Mapping[str, Any], where: str = "") -> T:
+def read(kind: type[T], data: Mapping[str, Any], where: str = "", together: bool = True) -> T:
     """A dataclass made with `pytree` from nested tables, every value checked.
+
+    Args:
+        kind: the dataclass.
+        data: its tables.
+        where: the beginning of a message, for instance the file.
+        together: whether the values of the outermost table are checked together as well (its `problem`).
 
     Raises:
         BadInput: an unknown or missing key, a wrong type, a value out of range; one line that names `where`, for
@@ -86,7 +95,7 @@ def read(kind: type[T], data: Mapping[str, Any], where: str = "") -> T:
     except ValidationError as error:
         raise BadInput(prefix + _explain(kind, data, error)) from None
     for path, node in _nodes(result):
-        if problem := getattr(node, "problem", lambda: None)():
+        if (path or together) and (problem := getattr(node, "problem", lambda: None)()):
             raise BadInput(prefix + ".".join((*path, problem)))
     return result
 
@@ -126,6 +135,9 @@ def _explain(kind: Any, data: Any, error: ValidationError) -> str:
     """One line for the first thing that is wrong, unknown keys before what they may have been meant for."""
     problem = min(error.errors(), key=lambda problem: problem["type"] != "unexpected_keyword_argument")
     place: tuple[Any, ...] = problem["loc"]
+    no_list = problem["type"] in ("tuple_type", "too_long")
+    if problem["type"] == "missing" and isinstance(place[-1], int):  # a list that is too short
+        place, no_list = place[:-1], True
     node: Any = data
     annotation, path = kind, []
     for index, name in enumerate(place):
@@ -151,16 +163,24 @@ def _explain(kind: Any, data: Any, error: ValidationError) -> str:
             return f"{where}: is new here and has no kind.{meant} A new one needs a kind: {', '.join(known)}."
         hint = nearest(str(named), known)
         return f"{where}.kind: {named!r} is none of: {', '.join(known)}." + (f" Did you mean {hint}?" if hint else "")
-    is_missing = problem["type"] == "missing" and not isinstance(place[-1], int)
+    is_missing = problem["type"] == "missing" and not no_list
     found = "missing" if is_missing else f"{_shown(node)} is not allowed"
     if problem["type"] == "value_error" and "ctx" in problem:  # of a check of our own, which says why
         return f"{where}: {found}: {problem['ctx']['error']}."
-    hint = "" if is_missing else slip(annotation, node, functools.partial(_accepts, annotation))
+    accepts = functools.partial(_accepts, annotation)
+    hint = "" if is_missing else slip(annotation, node, accepts)
+    if no_list and (example := list_like(annotation, node, accepts)):
+        begin = "" if any(each.isdigit() for each in path) else f"{where}="
+        hint = f" For instance {begin}{example}.".replace(", ", ",")
+    elif others := _joined(data, where):
+        hint += f" Did you mean {' or '.join(others)}?"
+    if not is_missing and is_optional(annotation):
+        hint += ' "none" removes it.'
     return f"{where}: {found}. Allowed: {allowed(annotation)}{unit_text(annotation, ' ')}{reason(annotation)}.{hint}"
 
 
-def _accepts(annotation: Any, value: float) -> bool:
-    """Whether a field of this type accepts a number."""
+def _accepts(annotation: Any, value: Any) -> bool:
+    """Whether a field of this type accepts a value."""
     try:
         _adapter(annotation).validate_python(value)
     except ValidationError:
@@ -174,6 +194,8 @@ def _unknown_key(annotation: Any, node: Any, path: list[str], name: str, data: A
         base = variant_of(base, node)
     fields = annotations(base) if dataclasses.is_dataclass(base) else {}
     where = ".".join([*path, name])
+    if others := _joined(data, where):
+        return f"{where}: no such field. Did you mean {' or '.join(others)}?"
     hint = nearest(name, list(fields))
     if hint is None and (others := _elsewhere(data, where, name, node[name])):
         return f"{where}: no such field. Did you mean {' or '.join(others)}?"
@@ -188,6 +210,16 @@ def _elsewhere(data: Any, where: str, name: str, value: Any) -> list[str]:
     wanted = [f".{name}.{path}" for path, _ in leaves(value)] if isinstance(value, Mapping) else [f".{name}"]
     there = [".".join(path) for path in _paths(data) if not f"{'.'.join(path)}.".startswith(f"{where}.")]
     return [path for path in there if path.endswith(tuple(wanted))][:3]
+
+
+def _joined(data: Any, where: str) -> list[str]:
+    """Up to three paths of existing fields that are a wrong one with other separators: target.yaw for target_yaw."""
+
+    def bare(*keys: str) -> str:
+        return re.sub(r"[^0-9a-z]+", "_", "_".join(keys).lower())
+
+    ends = ((path, {bare(*path[depth:]) for depth in range(len(path) - 1)}) for path in _paths(data))
+    return [".".join(path) for path, joined in ends if ".".join(path) != where and bare(where) in joined][:3]
 
 
 def _paths(data: Any, path: tuple[str, ...] = ()) -> Iterator[tuple[str, ...]]:

@@ -29,7 +29,14 @@ def _computed(value: Any) -> Any:
 
 Derived = Annotated[Any, BeforeValidator(_computed)]
 Real = Annotated[float, Strict(), AllowInfNan(False), AfterValidator(_single)]
-Whole = Annotated[int, Strict()]
+
+
+def whole(value: Any) -> Any:
+    """The whole number that a float stands for, 100 for 1e2; anything else as it is."""
+    return int(value) if isinstance(value, float) and value.is_integer() else value
+
+
+Whole = Annotated[int, Strict(), BeforeValidator(whole)]
 Vector = tuple[Real, Real, Real]
 
 
@@ -91,6 +98,8 @@ def unit_text(annotation: Any, before: str = "") -> str:
     base, details = unwrap(annotation)
     if get_origin(base) is tuple:
         return unit_text(get_args(base)[0], before)
+    if is_union(base) and not any(isinstance(detail, annotated_types.Unit) for detail in details):
+        return next(filter(None, (unit_text(option, before) for option in get_args(base))), "")
     for detail in details:
         if isinstance(detail, annotated_types.Unit) and detail.unit != "1":
             return before + detail.unit
@@ -132,6 +141,59 @@ def slip(annotation: Any, value: Any, accepts: Callable[[float], bool]) -> str:
         if accepts(value * factor):
             return f" Is it in {other}? Then write {value * factor:.4g}."
     return ""
+
+
+def list_like(annotation: Any, value: Any, accepts: Callable[[Any], bool]) -> list[Any] | None:
+    """A list that a field accepts and that is like what was given: cut, or filled up; None where there is none.
+
+    Args:
+        annotation: of the field, which takes a list of numbers.
+        value: that was refused: a list, one number, or a text such as "0,0,1".
+        accepts: whether the field accepts a list.
+    """
+    base = inner_type(annotation)
+    items = [item for item in get_args(base) if item is not Ellipsis]
+    if get_origin(base) is not tuple or not is_number(items[0]):
+        return None
+    if isinstance(value, str):
+        value = [_number(part) for part in value.strip("[](){} ").replace(",", " ").replace(";", " ").split()]
+    given = list(value) if isinstance(value, list | tuple) else [value]
+    count = len(items) if len(items) == len(get_args(base)) else len(given)
+    for filler in (0, *given[-1:], 1):
+        example = (given + [filler] * count)[:count]
+        if example and accepts(example):
+            return example
+    return None
+
+
+def _number(text: str) -> Any:
+    try:
+        return whole(float(text))
+    except (ValueError, OverflowError):
+        return text
+
+
+def is_number(annotation: Any) -> bool:
+    """Whether a field takes a number."""
+    return unwrap(annotation)[0] in (int, float)
+
+
+def inner_type(annotation: Any) -> Any:
+    """The type of a field without its Annotated layers, and of an optional one without None."""
+    base, _ = unwrap(annotation)
+    kept = [option for option in get_args(base) if option is not type(None)] if is_union(base) else []
+    return unwrap(kept[0])[0] if len(kept) == 1 else base
+
+
+def is_optional(annotation: Any) -> bool:
+    """Whether a field may be left empty."""
+    base, _ = unwrap(annotation)
+    return is_union(base) and type(None) in get_args(base)
+
+
+def is_named(annotation: Any) -> bool:
+    """Whether a field holds entries under names that the user chooses."""
+    return get_origin(unwrap(annotation)[0]) is dict
 
 
 def unwrap(annotation: Any) -> tuple[Any, list[Any]]:

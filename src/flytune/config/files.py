@@ -5,7 +5,7 @@ import fcntl
 import json
 import os
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -86,7 +86,9 @@ def held(path: Path, field: str = "out") -> Iterator[None]:
         os.close(descriptor)
 
 
-def check_file(path: Path, field: str = "out", *, mark: bytes = b"", kind: str = "") -> None:
+def check_file(
+    path: Path, field: str = "out", *, mark: bytes = b"", kind: str = "", suffixes: Sequence[str] = ()
+) -> None:
     """Refuse a path that no file may be written to, before anything is computed.
 
     Args:
@@ -95,22 +97,37 @@ def check_file(path: Path, field: str = "out", *, mark: bytes = b"", kind: str =
         mark: bytes at the beginning or the end of every file of this kind that flytune writes; where given, a file
             that is there and lacks them is not replaced.
         kind: what flytune writes, in words.
+        suffixes: where given, another one is refused; a name without one is taken as it is.
 
     Raises:
-        BadInput: the path is a folder, its folder does not exist, it is a file of a run, or a file of somebody else.
+        BadInput: the name says another format; or the path is a folder, its folder does not exist, it is a file of a
+            run, or a file of somebody else.
     """
     place = Path(os.path.realpath(path)) if os.path.islink(path) else path
     if not os.path.isdir(place.parent):  # unlike Path.is_dir, also where the name itself is too long
         raise BadInput(f"{field}: {place.parent} is no folder. Give a file in a folder that exists.")
     if os.path.isdir(place):
         raise BadInput(f"{field}: {path} is a folder. Give a file.")
-    if not mark or not os.path.exists(place) or _is_special(place):
-        return
-    if place.name in RUN_FILES and os.path.exists(place.with_name("run.json")):
+    exists = bool(mark) and os.path.exists(place) and not _is_special(place)
+    if exists and place.name in RUN_FILES and os.path.exists(place.with_name("run.json")):
         raise BadInput(f"{field}: {path} is a file of a run, which is not replaced. Give another path.")
-    if not _is_marked(place, mark):
+    check_suffix(path, field, kind, suffixes)
+    if exists and not _is_marked(place, mark):
         raise BadInput(
             f"{field}: {path} is there and is not {kind} of flytune. Give another path, or remove this file."
+        )
+
+
+def check_suffix(path: Path, field: str, kind: str, suffixes: Sequence[str]) -> None:
+    """Refuse a file name that says another format; one that says none is taken as it is.
+
+    Raises:
+        BadInput: it has a suffix that is not among `suffixes`, where there are any.
+    """
+    if suffixes and path.suffix and path.suffix.lower() not in suffixes:
+        raise BadInput(
+            f"{field}: {path} is not allowed. Allowed: {kind}, whose name ends in {' or '.join(suffixes)}. Did you "
+            f"mean {path.with_suffix(suffixes[0])}?"
         )
 
 

@@ -1,9 +1,9 @@
 """Removing what a file or an edit no longer wants: TOML has no null, so that the text "none" takes its place."""
 
 from collections.abc import Mapping
-from typing import Any, get_args, get_origin
+from typing import Any
 
-from flytune.config.fields import is_union, step_into, unwrap
+from flytune.config.fields import is_named, is_optional, step_into
 
 NONE = "none"
 
@@ -21,19 +21,9 @@ def without_none(kind: Any, data: Mapping[str, Any]) -> dict[str, Any]:
     for key, value in data.items():
         inner = step_into(kind, key, data)
         if value == NONE and isinstance(value, str):
-            if is_named(kind) or _is_optional(inner):
+            if is_named(kind) or is_optional(inner):
                 continue
             result[key] = {} if is_named(inner) else value
         else:
             result[key] = without_none(inner, value) if inner is not None and isinstance(value, Mapping) else value
     return result
-
-
-def is_named(annotation: Any) -> bool:
-    """Whether a field holds entries under names that the user chooses."""
-    return get_origin(unwrap(annotation)[0]) is dict
-
-
-def _is_optional(annotation: Any) -> bool:
-    base, _ = unwrap(annotation)
-    return is_union(base) and type(None) in get_args(base)

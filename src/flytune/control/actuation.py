@@ -6,8 +6,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from flytune.physics.components import Components, add, cross, pack
-from flytune.physics.dynamics import CONTROL_PERIOD, commanded_rotor_speed, rotor_speed_after
-from flytune.physics.rotors import directions
+from flytune.physics.dynamics import angular_momentum, rotor_speed_after
+from flytune.physics.rotors import action_of_rotor_speed, commanded_rotor_speed, directions, yaw_coefficient
 from flytune.physics.vehicle import Vehicle
 
 
@@ -23,14 +23,13 @@ def estimated_rotor_speed(vehicle: Vehicle, before: Components, last_action: Com
     action latency is not modelled.
     """
     commanded = tuple(commanded_rotor_speed(vehicle, motor) for motor in last_action)
-    return rotor_speed_after(vehicle, before, commanded, CONTROL_PERIOD)
+    return rotor_speed_after(vehicle, before, commanded, vehicle.control_period)
 
 
 def torque_for(vehicle: Vehicle, angular_acceleration: Components, body_rate: Components) -> Components:
     """The torque in N m that gives an angular acceleration in rad/s^2: J a + W x J W (Euler's equation)."""
-    momentum = tuple(i * w for i, w in zip(vehicle.inertia, body_rate, strict=True))
-    turning = tuple(i * a for i, a in zip(vehicle.inertia, angular_acceleration, strict=True))
-    return add(turning, cross(body_rate, momentum))
+    turning = angular_momentum(vehicle, angular_acceleration)
+    return add(turning, cross(body_rate, angular_momentum(vehicle, body_rate)))
 
 
 def allocate(vehicle: Vehicle, thrust: Any, torque: Components) -> Components:
@@ -38,14 +37,16 @@ def allocate(vehicle: Vehicle, thrust: Any, torque: Components) -> Components:
 
     Where a rotor would leave the range of the actions, yaw torque is reduced first, then thrust is changed, and roll
     and pitch torque are reduced last, in their ratio: a vehicle falls with a wrong tilt, not with a wrong heading.
+    Where thrust or drag torque has a linear part, yaw torque is taken as proportional to thrust, as it is about hover.
 
     Source: the inverse of paper R4, worked out by hand; the order of priorities is the usual one of flight stacks
     (PX4 user guide, "airmode").
     """
-    limits = tuple(commanded_rotor_speed(vehicle, jnp.asarray(action)) ** 2 for action in (-1.0, 1.0))
+    ends = (commanded_rotor_speed(vehicle, jnp.asarray(action)) for action in (-1.0, 1.0))
     solve = _x_squares if vehicle.rotors is None else _squares
-    squares = solve(vehicle, thrust, torque, limits)
-    return tuple(jnp.sqrt(jnp.maximum(square, 0.0)) for square in squares)  # at 0, rounding may leave a negative one
+    squares = solve(vehicle, thrust, torque, tuple(map(vehicle.square_of_speed, ends)))
+    # at 0, rounding may leave a negative one
+    return tuple(vehicle.speed_of_square(jnp.maximum(square, 0.0)) for square in squares)
 
 
 def _x_squares(vehicle: Vehicle, thrust: Any, torque: Components, limits: Components) -> Components:
@@ -68,7 +69,7 @@ def _x_squares(vehicle: Vehicle, thrust: Any, torque: Components, limits: Compon
     low_b, high_b = lowest + jnp.abs(second), highest - jnp.abs(second)
     middle = jnp.clip(thrust / (4 * vehicle.thrust_coefficient), (low_a + low_b) / 2, (high_a + high_b) / 2)
     yaw = jnp.clip(
-        torque[2] / (4 * vehicle.torque_coefficient),
+        torque[2] / (4 * yaw_coefficient(vehicle)),
         jnp.maximum(low_b - middle, middle - high_a),
         jnp.minimum(high_b - middle, middle - low_a),
     )
@@ -84,12 +85,12 @@ def _squares(vehicle: Vehicle, thrust: Any, torque: Components, limits: Componen
     y once s and f are known; that such a y exists bounds f once s is known; and that such an f exists bounds s
     (Fourier-Motzkin elimination). So s, f and y are found in this order, each as near as possible to its wanted value.
     """
-    square = vehicle.hover_rotor_speed_rpm**2  # everything is in units in which hovering takes 1
+    square = vehicle.hover_square  # everything is in units in which hovering takes 1
     weight = vehicle.mass * vehicle.gravity
     rows = jnp.asarray([(1, 1, 1, 1), *directions(vehicle)], float)
     reach = jnp.max(jnp.abs(rows[1:3]))
     columns = jnp.linalg.inv(rows / jnp.stack([1.0, reach, reach, 1.0])[:, None] / 4)
-    units = (weight, weight * reach, weight * reach, weight * vehicle.torque_coefficient / vehicle.thrust_coefficient)
+    units = (weight, weight * reach, weight * reach, weight * yaw_coefficient(vehicle) / vehicle.thrust_coefficient)
     wanted_thrust, roll, pitch, wanted_yaw = (part / unit for part, unit in zip((thrust, *torque), units, strict=True))
     r = columns[:, 1] * roll + columns[:, 2] * pitch
     t, c = columns[:, 0], columns[:, 3]
@@ -129,14 +130,20 @@ def action_for(
         command = now + (wanted - now) (1 - exp(-h / motor_time_constant)) / (1 - exp(-h / tau))
 
     A motor that is faster than that gets the wanted speed as its command; without the constant, each motor does.
+
+    Args:
+        vehicle: its motors and its convention of actions.
+        now: rotor speeds in rpm.
+        wanted: likewise.
+        motor_time_constant: in s, or None.
     """
     if motor_time_constant is not None:
-        faster = 1 - jnp.exp(-CONTROL_PERIOD / motor_time_constant)
-        rising = rotor_speed_after(vehicle, (0.0,), (1.0,), CONTROL_PERIOD)[0]
-        falling = 1 - rotor_speed_after(vehicle, (1.0,), (0.0,), CONTROL_PERIOD)[0]
+        period = vehicle.control_period
+        faster = 1 - jnp.exp(-period / motor_time_constant)
+        rising = rotor_speed_after(vehicle, (0.0,), (1.0,), period)[0]
+        falling = 1 - rotor_speed_after(vehicle, (1.0,), (0.0,), period)[0]
         wanted = tuple(
             speed + (goal - speed) * jnp.maximum(faster / jnp.where(goal > speed, rising, falling), 1.0)
             for speed, goal in zip(now, wanted, strict=True)
         )
-    hover = vehicle.hover_rotor_speed_rpm
-    return pack(tuple(jnp.clip((speed / hover - 1) / vehicle.action_scale, -1.0, 1.0) for speed in wanted))
+    return pack(tuple(jnp.clip(action_of_rotor_speed(vehicle, speed), -1.0, 1.0) for speed in wanted))

@@ -32,7 +32,10 @@ def classical_controller(name: str, task: Task, gains: str = "tuned") -> Control
         BadInput: no such controller or gains.
     """
     if gains not in SETS:
-        raise BadInput(f"gains: {gains!r} is not allowed. Allowed: {', '.join(SETS)}.")
+        hint = document.nearest(gains, SETS)
+        raise BadInput(
+            f"gains: {gains!r} is not allowed. Allowed: {', '.join(SETS)}." + (f" Did you mean {hint}?" if hint else "")
+        )
     return controller_with(read_gains(name)[gains], task)
 
 

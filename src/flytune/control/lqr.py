@@ -1,5 +1,6 @@
 """A linear quadratic regulator: the vehicle linearised about hover, and the best linear feedback for it."""
 
+import dataclasses
 from typing import Annotated, Any
 
 import jax
@@ -16,7 +17,13 @@ from flytune.control.sensing import Sensed, heading, sense
 from flytune.errors import BadInput
 from flytune.physics import dynamics, rotation
 from flytune.physics.components import Components, pack, unpack
-from flytune.physics.rotors import directions, mixed
+from flytune.physics.rotors import (
+    directions,
+    hover_action,
+    mixed,
+    rotor_speed_per_action,
+    square_per_rotor_speed,
+)
 from flytune.physics.vehicle import Vehicle
 
 # The state: position error (3) in m and velocity (3) in m/s, in axes that turn with the heading; roll, pitch and yaw
@@ -56,14 +63,14 @@ class Lqr(ClassicalController):
     def act(self, memory: Components, observation: Float[Array, "17"]) -> tuple[Components, Float[Array, "4"]]:
         """The action of one observation, see `Controller`.
 
-        The linear law gives small changes of thrust, f_i = f_hover (1 + 2 action_scale u_i). The allocation turns
-        their sums into rotor speeds, because it also decides what is reduced where a rotor is at its limit.
+        The linear law gives small changes of thrust, f_i = f_hover + (df/da at hover) u_i. The allocation turns their
+        sums into rotor speeds, because it also decides what is reduced where a rotor is at its limit.
         """
         sensed = sense(observation)
         rotors = estimated_rotor_speed(self.vehicle, memory, sensed.last_action)
         change = unpack(-self.gain @ pack(self.deviation(sensed, rotors)))
-        hover = self.vehicle.hover_rotor_speed_rpm
-        squares = tuple(hover**2 * (1 + 2 * self.vehicle.action_scale * u) for u in change)
+        slope = square_per_rotor_speed(self.vehicle) * rotor_speed_per_action(self.vehicle)
+        squares = tuple(self.vehicle.hover_square + slope * u for u in change)
         thrust, torque = mixed(self.vehicle, squares)
         return rotors, action_for(self.vehicle, rotors, allocate(self.vehicle, thrust, torque))
 
@@ -76,8 +83,7 @@ class Lqr(ClassicalController):
         if self.body_rate_limit is not None:
             largest = jnp.minimum(largest, self.body_rate_limit / self._ratio(directions(self.vehicle)[2], 8, 11))
         yaw_error = jnp.clip(yaw, -largest, largest)
-        hover = self.vehicle.hover_rotor_speed_rpm
-        speeds = ((speed / hover - 1) / self.vehicle.action_scale for speed in rotors)
+        speeds = _in_actions(self.vehicle, rotors)
         velocity = _turned(sensed.velocity, yaw)
         return *position, *velocity, 2 * tilted[0], 2 * tilted[1], yaw_error, *sensed.body_rate, *speeds
 
@@ -137,18 +143,25 @@ def linearised(vehicle: Vehicle) -> tuple[np.ndarray, np.ndarray]:
 def _after(vehicle: Vehicle, x: Float[Array, "16"], u: Float[Array, "4"]) -> Float[Array, "16"]:
     """The deviation from hover one control period later."""
     parts, hover = unpack(x), vehicle.hover_rotor_speed_rpm
+    latest = dataclasses.replace(vehicle, action_latency_steps=0)
     state = dynamics.State(
         position=parts[:3],
         velocity=parts[3:6],
         attitude=rotation.exponential(parts[6:9]),
         body_rate=parts[9:12],
-        rotor_speed_rpm=tuple(hover * (1 + vehicle.action_scale * r) for r in parts[12:]),
-        pending_actions=jnp.zeros((0, 4)),
+        rotor_speed_rpm=tuple(hover + rotor_speed_per_action(vehicle) * r for r in parts[12:]),
+        pending_actions=dynamics.no_pending_actions(latest),
     )
-    end = dynamics.step(vehicle, state, u)
-    speeds = tuple((speed / hover - 1) / vehicle.action_scale for speed in end.rotor_speed_rpm)
+    end = dynamics.step(latest, state, hover_action(vehicle) + u)
+    speeds = _in_actions(vehicle, end.rotor_speed_rpm)
     angles = tuple(2 * part for part in end.attitude[:3])
     return pack((*end.position, *end.velocity, *angles, *end.body_rate, *speeds))
+
+
+def _in_actions(vehicle: Vehicle, rotors: Components) -> Components:
+    """How far rotor speeds lie from hover, in units of the action."""
+    hover, slope = vehicle.hover_rotor_speed_rpm, rotor_speed_per_action(vehicle)
+    return tuple((speed - hover) / slope for speed in rotors)
 
 
 _jacobians = jax.jit(jax.jacrev(_after, argnums=(1, 2)))

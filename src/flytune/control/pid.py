@@ -12,7 +12,6 @@ from flytune.control.actuation import action_for, allocate, estimated_rotor_spee
 from flytune.control.controller import ClassicalController, shortened, slowed, specific_force
 from flytune.control.sensing import Sensed, body_axes, dot, heading, sense
 from flytune.physics.components import Components, add, scale
-from flytune.physics.dynamics import CONTROL_PERIOD
 from flytune.physics.rotation import safe_norm
 
 PerSecond = Annotated[Real, Gt(0), Unit("1/s")]
@@ -81,7 +80,7 @@ class Pid(ClassicalController):
         damping = (g.horizontal_velocity, g.horizontal_velocity, g.vertical_velocity)
         error = slowed(sensed.position_error, pull, self.speed_limit)
         near = safe_norm(sensed.position_error) <= g.integral_zone
-        grown = add(integral, scale(jnp.where(near, CONTROL_PERIOD, 0.0), sensed.position_error))
+        grown = add(integral, scale(jnp.where(near, self.vehicle.control_period, 0.0), sensed.position_error))
         added = shortened(scale(-g.position_integral, grown), g.integral_limit)
         kept = safe_norm(scale(g.position_integral, grown)) <= g.integral_limit
         integral = tuple(jnp.where(kept, new, old) for new, old in zip(grown, integral, strict=True))

@@ -4,7 +4,7 @@ import dataclasses
 import itertools
 import json
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
@@ -19,17 +19,21 @@ from flytune.config import document
 from flytune.config.files import write_bytes
 from flytune.config.pytree import label, pytree, static
 from flytune.errors import BadInput
+from flytune.physics.vehicle import Vehicle
 from flytune.task import observation
 from flytune.task.dial import Dial, Input, Setting, checked_setting, number_of_inputs, read_named, told
-from flytune.task.observation import SIZE
+from flytune.task.observation import RATE, SIZE
 
 FORMAT = "flytune-policy-1"
 HEADER = "flytune"  # one entry: safetensors writes several in an order that changes from process to process
-ACTION = (
-    "4 motors [-1, 1]: rotor speed = hover speed * (1 + action_scale * action); "
-    "0 (+x, -y), 1 (-x, -y), 2 (-x, +y), 3 (+x, +y)"
-)
-CONVENTIONS = {"observation": observation.LAYOUT, "action": ACTION, "rate": "100 Hz"}  # in every policy's file
+MOTORS = "; 0 (+x, -y), 1 (-x, -y), 2 (-x, +y), 3 (+x, +y)"
+ACTIONS = {  # `Vehicle.action_convention` -> what an action is
+    "hover_relative": f"4 motors [-1, 1]: rotor speed = hover speed * (1 + action_scale * action){MOTORS}",
+    "rotor_speed": f"4 motors [-1, 1]: rotor speed, linear from the least at -1 to the largest at 1{MOTORS}",
+    "thrust": f"4 motors [-1, 1]: thrust, linear from the least at -1 to the largest at 1{MOTORS}",
+}
+ACTION = ACTIONS["hover_relative"]
+CONVENTIONS = {"observation": observation.LAYOUT, "action": ACTION, "rate": f"{RATE} Hz"}  # unless `about` says others
 
 
 @pytree
@@ -62,6 +66,12 @@ def make_network(key: jax.Array, sizes: Sequence[int], last_gain: float) -> Netw
         weights=tuple(jax.nn.initializers.orthogonal(gain)(k, shape) for gain, k, shape in layers),
         biases=tuple(jnp.zeros(size) for size in sizes[1:]),
     )
+
+
+def with_output(network: Network, value: Any) -> Network:
+    """The network with the same bias for each of its outputs."""
+    *others, last = network.biases
+    return dataclasses.replace(network, biases=(*others, jnp.full_like(last, value)))
 
 
 @pytree
@@ -148,6 +158,40 @@ def limited(observation: Float[Array, "*batch 17"], error_limit: Any) -> Float[A
     return jnp.concatenate([factor * error, observation[..., 3:]], axis=-1)
 
 
+def conventions(about: Mapping[str, Any]) -> dict[str, str]:
+    """What the numbers of a policy mean, for the header of its file, from the facts about it."""
+    found = dict(CONVENTIONS)
+    if convention := about.get("action_convention"):
+        found["action"] = ACTIONS[convention]
+    if rate := about.get("control_rate"):
+        found["rate"] = f"{rate} Hz"
+    return found
+
+
+def facts_of_vehicle(vehicle: Vehicle) -> dict[str, Any]:
+    """The facts about a policy that its vehicle decides, for `Policy.about`; the usual conventions are left out."""
+    facts: dict[str, Any] = {"vehicle": vehicle.name}
+    if vehicle.action_convention != "hover_relative":
+        facts["action_convention"] = vehicle.action_convention
+    if vehicle.control_rate != RATE:
+        facts["control_rate"] = vehicle.control_rate
+    return facts
+
+
+def check_actions_fit(about: Mapping[str, Any], vehicle: Vehicle, name: str) -> None:
+    """Refuse a vehicle for which the actions of a policy mean something else.
+
+    Raises:
+        BadInput: both conventions, and the remedy.
+    """
+    own = about.get("action_convention", "hover_relative")
+    if own != vehicle.action_convention:
+        raise BadInput(
+            f"{name or 'policy'}: its actions follow the convention {own}, and those of the vehicle {vehicle.name} "
+            f"{vehicle.action_convention}. Give a vehicle with action_convention = {own}, or train a policy for it."
+        )
+
+
 def save_policy(path: Path, policy: Policy) -> None:
     """Write a policy as safetensors; its header has the conventions and `about`, as JSON.
 
@@ -159,7 +203,7 @@ def save_policy(path: Path, policy: Policy) -> None:
         tensors["bounds"] = np.asarray(policy.bounds)
     for part, layers in (("weight", policy.actor.weights), ("bias", policy.actor.biases)):
         tensors |= {f"actor.{index}.{part}": np.asarray(layer) for index, layer in enumerate(layers)}
-    header = {"format": FORMAT, "squash": policy.squash, **CONVENTIONS, "about": policy.about}
+    header = {"format": FORMAT, "squash": policy.squash, **conventions(policy.about), "about": policy.about}
     if math.isfinite(policy.error_limit):
         header["error_limit"] = float(policy.error_limit)
     if policy.dials:

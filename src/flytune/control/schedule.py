@@ -8,9 +8,9 @@ from typing import Any, Protocol, runtime_checkable
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float
 
-from flytune.config.pytree import pytree
+from flytune.config.pytree import pytree, static
 from flytune.errors import BadInput
 from flytune.physics.dynamics import CONTROL_PERIOD
 from flytune.task.dial import Dial, Setting, as_number, checked_setting
@@ -50,8 +50,9 @@ class ScheduledPolicy:
     """
 
     policy: Dialled
-    first_steps: dict[str, Int[Array, "_"]]  # dial -> the control step from which each of its values holds
+    times: dict[str, Float[Array, "_"]]  # dial -> the time in s from which each of its values holds
     shares: dict[str, Float[Array, "_"]]  # of the range, for each value
+    control_period: float = static(default=CONTROL_PERIOD)  # s
 
     @property
     def dials(self) -> dict[str, Dial]:
@@ -63,7 +64,7 @@ class ScheduledPolicy:
         """The value of each dial; of a dial that is turned, its pairs [time in s, value]."""
         setting: dict[str, Any] = {name: float(value) for name, value in self.policy.setting.items()}
         for name, shares in self.shares.items():
-            times = (round(CONTROL_PERIOD * int(step), 6) for step in self.first_steps[name])
+            times = (float(f"{float(time):.6g}") for time in self.times[name])
             values = (float(f"{float(self.dials[name].at(share)):.6g}") for share in shares)
             setting[name] = [list(pair) for pair in zip(times, values, strict=True)]
         return setting
@@ -92,9 +93,10 @@ class ScheduledPolicy:
 
     def _moved(self, name: str, step: Any, share: Any) -> Any:
         """The share of the range at which a dial stands in this step, from that of the step before."""
-        wanted = self.shares[name][jnp.sum(self.first_steps[name] <= step) - 1]
+        period = self.control_period
+        wanted = self.shares[name][jnp.sum(self.times[name] < (step + 0.5) * period) - 1]
         sweep_time = self.dials[name].sweep_time
-        fastest = jnp.where(sweep_time > 0, CONTROL_PERIOD / jnp.maximum(sweep_time, CONTROL_PERIOD), 1.0)
+        fastest = jnp.where(sweep_time > 0, period / jnp.maximum(sweep_time, period), 1.0)
         return share + jnp.clip(wanted - share, -fastest, fastest)
 
 
@@ -111,7 +113,7 @@ def with_schedule(policy: Dialled, schedule: Schedule) -> Any:
     """
     fixed = {name: value for name, value in schedule.items() if not isinstance(value, list | tuple)}
     policy = policy.at(fixed)
-    first_steps, shares = {}, {}
+    times, shares = {}, {}
     for name in schedule.keys() - fixed.keys():
         pairs = [_pair(name, each) for each in schedule[name]]
         steps = [round(time / CONTROL_PERIOD) for time, _ in pairs]
@@ -120,10 +122,10 @@ def with_schedule(policy: Dialled, schedule: Schedule) -> Any:
                 f"dial: {name}={schedule[name]} is not allowed. Allowed: [[0, value], [time in s, value], ...], with "
                 "rising times."
             )
-        first_steps[name] = jnp.asarray(steps, jnp.int32)
+        times[name] = jnp.asarray([float(time) for time, _ in pairs])
         values = [checked_setting(policy.dials, {name: value})[name] for _, value in pairs]
         shares[name] = jnp.asarray([policy.dials[name].share(value) for value in values])
-    return ScheduledPolicy(policy=policy, first_steps=first_steps, shares=shares) if shares else policy
+    return ScheduledPolicy(policy=policy, times=times, shares=shares) if shares else policy
 
 
 def settings_along(controller: Any, task: Task, steps: int) -> dict[str, Float[np.ndarray, "steps"]]:

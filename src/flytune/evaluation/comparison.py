@@ -8,11 +8,13 @@ from flytune.evaluation.comparison_table import MAY_DIFFER, comparison_text
 from flytune.evaluation.difference import Difference, Metric, compare_metric, metrics_of
 from flytune.evaluation.judge import Judgement
 
-SHARED = {  # what has to be the same: the option that sets it, and its unit
-    "trials": ("trials", ""),
-    "seed": ("seed", ""),
-    "initial_conditions": ("starts", ""),
-    "duration": ("duration", " s"),
+SHARED = {  # what has to be the same: how it is called, the option that sets it, and its unit
+    "task": ("task", "task", ""),
+    "vehicle": ("vehicle", "task", ""),
+    "trials": ("trials", "trials", ""),
+    "seed": ("seed", "seed", ""),
+    "initial_conditions": ("starts", "starts", ""),
+    "duration": ("duration", "duration", " s"),
 }
 
 
@@ -57,9 +59,9 @@ def compare(judgements: Sequence[Judgement], *, reference: int = 0) -> Compariso
     """The comparison of two or more controllers over the same trials.
 
     Initial state and noise of a trial depend on seed and trial alone. So trial i of one controller is paired with
-    trial i of the reference, and their difference does not contain the spread of the initial states. Simulator, task
-    and vehicle may differ. Names that occur twice are made different. `reference` is the index of the controller that
-    the others are compared with.
+    trial i of the reference, and their difference does not contain the spread of the initial states. Task, vehicle,
+    duration and initial conditions are the same for all; the simulator may differ. Names that occur twice are made
+    different. `reference` is the index of the controller that the others are compared with.
 
     Raises:
         BadInput: fewer than two, no such reference, or trials that are not the same.
@@ -72,12 +74,12 @@ def compare(judgements: Sequence[Judgement], *, reference: int = 0) -> Compariso
         raise BadInput(f"reference: {reference} is not allowed. Allowed: 0 to {len(judgements) - 1}, a controller.")
     named = _distinguish(judgements)
     first = named[0]
-    for field, (option, unit) in SHARED.items():
+    for field, (label, option, unit) in SHARED.items():
         wanted = getattr(first, field)
         for other in named:
             if (value := getattr(other, field)) != wanted:
                 raise BadInput(
-                    f"{option}: {wanted}{unit} for {first.name} and {value}{unit} for {other.name} is not allowed. "
+                    f"{label}: {wanted}{unit} for {first.name} and {value}{unit} for {other.name} is not allowed. "
                     f"Allowed: the same for every controller. Fly all of them with one --{option}."
                 )
     against = named[reference]

@@ -19,10 +19,11 @@ MAY_DIFFER = ("simulator", "task", "vehicle")  # between controllers whose trial
 LONGEST = 30  # characters of a name in the table
 
 NOTE = (
-    "Differences are medians over the trials, each with itself: infinite where one controller settles, or flies on, "
-    "and the",
-    "other does not. Intervals are for these controllers as they are; another training of the same kind would differ "
-    "more.",
+    "Differences are medians over the trials, each with itself. One that has no number, since one controller settles, "
+    "or flies",
+    "on, and the other does not, counts as infinite. Intervals are for these controllers as they are; another training "
+    "of the same",
+    "kind would differ more.",
 )
 
 COLUMNS = (  # spaces at the ends of a heading place it in a terminal
@@ -114,6 +115,9 @@ def conditions(comparison: "Comparison") -> str:
         same = len(set(flown.values())) == 1
         values = flown[first.name] if same else ", ".join(f"{value} ({name})" for name, value in flown.items())
         text.append(f"{LABELS.get(field, field)} {values}")
+    if first.changes:
+        met = ", ".join(f"{path}={value}" for path, value in first.changes.items())
+        text.append(f"every controller meets {met}, and was told otherwise")
     for judgement in judgements:
         if judgement.made_for:
             text.append(
@@ -135,34 +139,53 @@ def sentences(comparison: "Comparison") -> list[list[str]]:
 
 
 def _clause(difference: Difference, against: str, whole: bool) -> str:
-    metric = difference.metric
-    (more, less), (unit, scale) = metric.ways, metric.shown
-    unit = {"1": "", "%": " % of the step"}.get(unit, f" {unit}")
-    name = f"{_short(difference.name)} " if whole else ""
-    middle, low, high = difference.median, difference.low, difference.high
+    metric, name = difference.metric, f"{_short(difference.name)} " if whole else ""
     if not difference.compared:
-        return f"{name}{metric.verb}: no trial to compare with {against}"
-    better, worse = difference.better, difference.worse
-    if middle < 0:  # say it the other way round, so that its numbers are positive
-        more, less, middle, low, high, better, worse = less, more, -middle, -high, -low, worse, better
+        return f"{name}has no trial whose {metric.title} can be compared with that of {against}"
+    trials = difference.compared + difference.left_out
+    if 2 * difference.both_failed > difference.compared:
+        pair = f"{name}and {against}: " if whole else ""
+        return f"{pair}{metric.neither} in {difference.both_failed} of {trials} trials"
+    if math.isinf(difference.median):
+        worse, better = metric.outcomes
+        mine, other = (worse, better) if difference.median > 0 else (better, worse)
+        return f"{name}{mine} where {against} {other}{_interval(difference)}, {_counts(difference)}"
+    unit, scale = metric.shown
+    unit = {"1": "", "%": " % of the step"}.get(unit, f" {unit}")
+    said = f"{metric.equal} {against}"
+    if difference.median:
+        size = f"{abs(difference.median) * scale:.{metric.decimals}f}{unit}"
+        said = f"{size} {metric.ways[difference.median < 0]}" + f" than {against}" * whole
+    return f"{name}{metric.verb} {said}{_interval(difference)}, {_counts(difference)}"
 
-    def amount(value: float) -> str:
-        return f"{abs(value) * scale:.{metric.decimals}f}" if math.isfinite(value) else "infinitely"
 
-    if middle == 0:
-        said = f"{metric.equal} {against}"
-    else:
-        said = f"{amount(middle)}{unit if math.isfinite(middle) else ''} {more}" + f" than {against}" * whole
-    if math.isinf(low) and low == high:
-        interval = "likewise"
-    elif low >= 0 and middle > 0:
-        interval = f"{amount(low)} to {amount(high)}"
-    else:
-        interval = " to ".join(f"{amount(end)} {more if end > 0 else less}" if end else "0" for end in (low, high))
-    counts = [f"{more} in {worse} of {difference.compared + difference.left_out} trials"]
-    others = {less: better, "equal": difference.tied, "not comparable": difference.left_out}
-    counts += [f"{how} in {number}" for how, number in others.items() if number]
-    return f"{name}{metric.verb} {said} (95 % interval {interval}), {', '.join(counts)}"
+def _interval(difference: Difference) -> str:
+    """The 95 % interval in brackets; empty where it has no number at either end."""
+    metric, low, high = difference.metric, difference.low, difference.high
+    if difference.median < 0:  # say it the other way round, so that its numbers are positive
+        low, high = -high, -low
+    scale, alone = metric.shown[1], low >= 0 and difference.median != 0  # alone: it lies on one side, which was said
+
+    def end(value: float) -> str:
+        way = "" if alone or not value else f" {metric.ways[(value < 0) != (difference.median < 0)]}"
+        return f"{abs(value) * scale:.{metric.decimals}f}{way}" if value else "0"
+
+    if math.isinf(low) and math.isinf(high):
+        return ""
+    text = f"from {end(low)} on" if math.isinf(high) else f"up to {end(high)}" if math.isinf(low) else ""
+    return f" (95 % interval {text or f'{end(low)} to {end(high)}'})"
+
+
+def _counts(difference: Difference) -> str:
+    """In how many trials a controller has more, and less, than the other one; the way of the median first."""
+    (more, less), better, worse = difference.metric.ways, difference.better, difference.worse
+    (first, number), other = (
+        ((less, better), (more, worse)) if difference.median < 0 else ((more, worse), (less, better))
+    )
+    counts = [f"{first} in {number} of {difference.compared + difference.left_out} trials"]
+    equal = difference.tied - difference.both_failed
+    others = (other, ("equal", equal), ("neither", difference.both_failed), ("not comparable", difference.left_out))
+    return ", ".join([*counts, *(f"{how} in {count}" for how, count in others if count)])
 
 
 def _short(name: str) -> str:

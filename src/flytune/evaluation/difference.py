@@ -52,6 +52,18 @@ class Metric:
         return FIELDS[self.field][1:]
 
     @property
+    def outcomes(self) -> tuple[str, str]:
+        """What a controller does in a trial without a number, and what in one with a number, for a sentence."""
+        if self.field == "settling_time":
+            return self.verb.replace("settles", "does not settle"), self.verb
+        return "crashes", "does not"
+
+    @property
+    def neither(self) -> str:
+        """What is said of two controllers that both have no number."""
+        return f"neither {self.verb}" if self.field == "settling_time" else "both crash"
+
+    @property
     def shown(self) -> tuple[str, float]:
         """The unit of tables and figures, and its factor."""
         return ("%", 100.0) if self.field == "overshoot" else SHOWN.get(self.unit, (self.unit, 1.0))
@@ -108,6 +120,7 @@ class Difference:
     worse: int
     tied: int  # trials with equal values, or in which both failed
     left_out: int  # trials to which the metric does not apply
+    both_failed: int = 0  # of the tied ones
 
     @property
     def compared(self) -> int:
@@ -139,10 +152,12 @@ def paired_difference(controller: PerTrial, reference: PerTrial) -> PerTrial:
 
 def compare_metric(controller: Judgement, reference: Judgement, metric: Metric) -> Difference:
     """How a controller differs from the reference in one metric, with the 95 % bootstrap interval of the median."""
-    paired = paired_difference(metric.values(controller), metric.values(reference))
+    mine, other = metric.values(controller), metric.values(reference)
+    paired = paired_difference(mine, other)
     left_out = np.isnan(paired)
     middle, low, high = median_and_interval(paired[~left_out])
-    flags = {"better": paired < 0, "worse": paired > 0, "tied": paired == 0, "left_out": left_out}
+    flags = {"better": paired < 0, "worse": paired > 0, "tied": paired == 0, "left_out": left_out,
+             "both_failed": np.isposinf(mine) & np.isposinf(other)}  # fmt: skip
     counts = {name: int(np.count_nonzero(flag)) for name, flag in flags.items()}
     return Difference(name=controller.name, metric=metric, median=middle, low=low, high=high, **counts)
 

@@ -57,7 +57,7 @@ def evaluate(
         name: the controller's name in tables; where empty, the one it was found by.
         dial: of a policy with dials: dial -> its value, or pairs [[time in s, value], ...] by which it is turned in
             flight; the policy's own setting where None.
-        **settings: of `fly`: trials, seed, duration, initial_conditions, simulator, simulator_options.
+        **settings: of `fly`: changes, trials, seed, duration, initial_conditions, simulator, simulator_options.
 
     Raises:
         BadInput: the controller, the task or a setting cannot be used.
@@ -125,7 +125,7 @@ def write_evaluation(folder: Path, judgement: Judgement, task: Task | None = Non
     """Write `evaluation.json` into a folder, which may be new; returns the file.
 
     `evaluation.json` of a run directory belongs to the task of the run. Where `task`, which was flown, is another one,
-    the file is `evaluation-TASK.json`.
+    or the controller met something else, the file is `evaluation-TASK.json`, with a number for what was met.
 
     Raises:
         BadInput: the file cannot be written.
@@ -133,7 +133,9 @@ def write_evaluation(folder: Path, judgement: Judgement, task: Task | None = Non
     make_folder(folder)
     own = folder / "task.toml"
     name = EVALUATION
-    if task is not None and own.exists() and first_difference(document.plain(load_task(own)), document.plain(task)):
-        name = f"{Path(EVALUATION).stem}-{run_name(task.name, {})}.json"
+    if task is not None and own.exists():
+        other = first_difference(document.plain(load_task(own)), document.plain(task))
+        if other is not None or judgement.changes:
+            name = f"{Path(EVALUATION).stem}-{run_name(task.name, judgement.changes)}.json"
     write_json(folder / name, judgement.to_dict())
     return folder / name

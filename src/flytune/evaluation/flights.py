@@ -35,6 +35,7 @@ class Labels:
     initial_conditions: str  # "clear" or "paper"; "as logged" elsewhere
     dial: Mapping[str, Any] = dataclasses.field(default_factory=dict)  # dial -> value, or its pairs [time in s, value]
     made_for: str = ""  # the vehicle that a policy was trained on, where another one flew
+    changes: Mapping[str, Any] = dataclasses.field(default_factory=dict)  # field path -> what was met in its place
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -148,6 +149,7 @@ class Flights(Labels):
             starts=self.initial_conditions,
             dial=json.dumps(dict(self.dial)),
             made_for=self.made_for,
+            changes=json.dumps(dict(self.changes)),
         )
         write_bytes(path, content.getvalue(), "flights")
 
@@ -201,4 +203,5 @@ class Flights(Labels):
             initial_conditions=str(arrays["starts"]),
             dial=json.loads(str(arrays["dial"])),
             made_for=str(arrays["made_for"]),
+            changes=json.loads(str(arrays["changes"])) if "changes" in arrays else {},
         )

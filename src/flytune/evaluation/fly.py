@@ -10,12 +10,14 @@ import jax.numpy as jnp
 import numpy as np
 
 from flytune.control.controller import Controller
+from flytune.control.policy import check_actions_fit
 from flytune.control.schedule import ScheduledPolicy, settings_along, shown_setting
 from flytune.errors import BadInput, Diverged
 from flytune.evaluation.flights import Flights
 from flytune.evaluation.margins import CHUNK, largest_speed_bound, recorded_margins
 from flytune.kernels.programs import program
-from flytune.physics.dynamics import CONTROL_PERIOD
+from flytune.physics.dynamics import no_pending_actions
+from flytune.physics.rotors import hover_action
 from flytune.physics.vehicle import Vehicle
 from flytune.runs.find import FoundController
 from flytune.simulation.environment import Episode, begin, hold, is_crashed
@@ -24,6 +26,7 @@ from flytune.simulation.rollout import Draw, rollout
 from flytune.simulation.simulator import WIDTHS, Simulator, VehicleStates, state_from, state_numbers
 from flytune.simulation.simulators import make_simulator
 from flytune.task.initial_state import EVALUATION_INITIAL_STATES, InitialState
+from flytune.task.met import as_met
 from flytune.task.observation import SIZE, draw_noise
 from flytune.task.target import sampled
 from flytune.task.task import Task
@@ -41,6 +44,7 @@ def fly(
     initial_conditions: InitialConditions | InitialState = "clear",
     duration: float | None = None,
     name: str = "",
+    changes: Mapping[str, Any] | None = None,
     simulator: str | Callable[[Vehicle, int], Simulator] = "flytune",
     simulator_options: Mapping[str, Any] | None = None,
 ) -> Flights:
@@ -57,6 +61,8 @@ def fly(
         initial_conditions: `clear` (z0 >= 0.1 m), `paper` (exactly as printed), or a distribution of your own.
         duration: of a trial in s, more than 0.5; the task's own where None.
         name: the controller's name in the flights.
+        changes: field path -> its true value, of the vehicle or the noise, where the controller meets something else
+            than `task`, which is what it was told; see `task.met`.
         simulator: one of `flytune`, `pybullet`, `mujoco`; or a function that makes another one, from a vehicle and the
             number of trials.
         simulator_options: of that simulator, see `make_simulator`.
@@ -65,7 +71,7 @@ def fly(
         BadInput: an argument out of range, or a simulator that is not installed.
         Diverged: the controller answered a finite observation with an action that is not finite.
     """
-    made_for = ""
+    made_for, changes = "", dict(changes or {})
     if isinstance(controller, FoundController):
         controller, name, made_for = controller.controller, name or controller.name, controller.made_for(task)
     family, task = task, task.at({name: values[0] for name, values in settings_along(controller, task, 1).items()})
@@ -74,13 +80,15 @@ def fly(
     starts_name = "own" if own else initial_conditions
     _check_arguments(trials, seed, "clear" if own else starts_name, duration)
     _check_controller(controller)
-    steps = round(duration / CONTROL_PERIOD)
+    check_actions_fit(getattr(getattr(controller, "policy", controller), "about", {}), task.vehicle, name)
+    period = task.vehicle.control_period
+    steps = round(duration / period)
     initial_state = initial_conditions if own else EVALUATION_INITIAL_STATES[initial_conditions]
     if problem := initial_state.problem() or initial_state.problem_around(task.target):
         raise BadInput(f"starts {starts_name}: {problem}")
     if problem := task.problem_of_path(duration):
         raise BadInput(problem)
-    task = dataclasses.replace(task, initial_state=initial_state)
+    task = as_met(dataclasses.replace(task, initial_state=initial_state), changes)
     starts, noise_keys = _begin(task, trial_keys(seed, trials))
     simulator_name, made = _made(simulator, task.vehicle, trials, simulator_options)
     try:
@@ -90,7 +98,7 @@ def fly(
     states, actions = np.asarray(record.states), np.asarray(record.actions)
     along = settings_along(controller, family, steps + 1) if isinstance(controller, ScheduledPolicy) else {}
     trajectories = VehicleStates.from_rows(np.ascontiguousarray(states.transpose(2, 0, 1)))
-    time = np.arange(steps + 1) * CONTROL_PERIOD
+    time = np.arange(steps + 1) * period
     place, yaw = sampled(task.target, time)
     return Flights(
         time=time,
@@ -109,6 +117,7 @@ def fly(
         initial_conditions=starts_name,
         dial=shown_setting(controller),
         made_for=made_for,
+        changes=changes,
     )
 
 
@@ -195,7 +204,7 @@ def rollout_trials(
     record, given, finite = _rollout_on_device(simulator.physics, controller, task, starts, noise_keys, steps)
     if not np.all(finite):
         trial, step = np.argwhere(~np.asarray(finite).T)[0]
-        raise _not_finite(controller, name, given[step, trial], trial, step)
+        raise _not_finite(controller, name, given[step, trial], trial, step * task.vehicle.control_period)
     return record
 
 
@@ -214,7 +223,7 @@ def _rollout_on_host(
         memory, action, given, finite = _decide(controller, memory, seen)
         if not np.all(finite):
             trial = int(np.argmin(finite))
-            raise _not_finite(controller, name, given[trial], trial, index)
+            raise _not_finite(controller, name, given[trial], trial, index * task.vehicle.control_period)
         moved = environment.step(np.asarray(action), _noise(noise_keys, index + 1))
         seen, crashed = environment.observation, moved.crashed
         states.append(environment.states.T)
@@ -251,9 +260,9 @@ def _episodes(task: Task, starts: jax.Array) -> jax.Array:
 
 def _started(task: Task, starts: jax.Array) -> Episode:
     def one(numbers: jax.Array) -> Episode:
-        state = state_from(numbers, jnp.zeros((task.vehicle.action_latency_steps, 4)))
+        state = state_from(numbers, no_pending_actions(task.vehicle))
         crashed = is_crashed(task, state, 0)
-        episode = begin(state)
+        episode = begin(task.vehicle, state)
         return dataclasses.replace(episode, steps=jnp.where(crashed, -1, episode.steps))
 
     return jax.vmap(one, in_axes=-1, out_axes=-1)(starts)
@@ -276,7 +285,7 @@ def _rollout_on_device(
         parts.append([np.asarray(each) for each in part])
     states, actions, given, finite = (np.concatenate(each) for each in zip(*parts, strict=True))
     states = np.concatenate([np.asarray(starts)[None], states])
-    actions = np.concatenate([np.zeros_like(actions[:1]), actions])
+    actions = np.concatenate([np.full_like(actions[:1], float(hover_action(task.vehicle))), actions])
     return Record(states, actions, np.asarray(episodes.steps) < 0), given, finite
 
 
@@ -339,10 +348,10 @@ def _decide(controller: Any, memory: Any, seen: jax.Array) -> tuple[Any, jax.Arr
     return memory, jnp.clip(given, -1.0, 1.0), given, finite
 
 
-def _not_finite(controller: Any, name: str, action: Any, trial: int | np.integer, step: int | np.integer) -> Diverged:
+def _not_finite(controller: Any, name: str, action: Any, trial: Any, time: float) -> Diverged:
     if failure := getattr(controller, "failure", None):  # of an ONNX model that was stopped in flight
         return Diverged(f"{name or 'controller'}: {failure}")
     return Diverged(
         f"{name or 'controller'}: action {action} is not finite in trial {trial} "
-        f"at {step * CONTROL_PERIOD:.2f} s, on a finite observation."
+        f"at {time:.2f} s, on a finite observation."
     )

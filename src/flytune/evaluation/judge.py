@@ -116,7 +116,9 @@ class Judgement(Labels):
             },
             "efficiency": {"median": median(self.efficiency)},
             "dial": dict(self.dial) or None,
+            "conditions": None,
             **({"made_for": self.made_for} if self.made_for else {}),
+            **({"set": dict(self.changes)} if self.changes else {}),
             **({"tracking": self.tracking.to_dict()} if self.tracking else {}),
             **({"steps": [step.to_dict() for step in self.steps]} if self.steps else {}),
         }

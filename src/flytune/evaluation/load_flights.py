@@ -8,9 +8,10 @@ from typing import Any
 
 import numpy as np
 
+from flytune.config.recognise import FLIGHTS, meant, misplaced
 from flytune.errors import BadInput
 from flytune.evaluation.flights import Flights
-from flytune.evaluation.log_columns import Column, check_columns, choose_columns, units_of
+from flytune.evaluation.log_columns import TIMES, Column, check_columns, choose_columns, units_of
 from flytune.evaluation.log_table import DELIMITERS, LARGEST, LogTable, open_log
 from flytune.evaluation.logged import flights_from, joined
 from flytune.evaluation.resampling import LONGEST_GAP
@@ -18,12 +19,7 @@ from flytune.evaluation.resampling import LONGEST_GAP
 ARRAYS = ("position", "yaw", "attitude", "velocity", "body_rate", "rotor_speed_rpm", "action")
 QUATERNION = ("qx", "qy", "qz", "qw")
 TARGET = ("target_x", "target_y", "target_z", "target_yaw")
-STEPS = {
-    "s": (4e-4, 0.25),
-    "ms": (0.4, 250.0),
-    "us": (400.0, 250e3),
-    "ns": (4e5, 250e6),
-}  # between samples: 4 to 2500 Hz
+RATES, DURATIONS = (2.0, 5000.0), (1.0, 7200.0)  # Hz and s, of a log whose unit of time nothing says
 FARTHEST = 100.0  # m; a position without a unit that reaches farther is probably in another one
 UNREADABLE = (OSError, EOFError, ValueError, KeyError, IndexError, TypeError, zipfile.BadZipFile, zlib.error)
 STILL = 1e-6  # m and rad; a target that changes by less stays the same
@@ -64,6 +60,8 @@ def load_flights(
     aim = None if target is None else _checked_target(target)
     flights = []
     for path in map(Path, paths):
+        if line := misplaced(str(path), FLIGHTS):
+            raise BadInput(line)
         if _is_zip(path):
             flights.append(_from_npz(path, columns, aim, start, longest_gap, on_message))
         else:
@@ -88,7 +86,8 @@ def _is_zip(path: Path) -> bool:
         with path.open("rb") as file:
             return file.read(4) == b"PK\x03\x04"
     except OSError as error:
-        raise BadInput(f"{path}: cannot be read ({error.strerror}). Give a .csv log or an .npz file.") from None
+        hint = meant(str(path), FLIGHTS, [], [".csv", ".npz"])
+        raise BadInput(f"{path}: cannot be read ({error.strerror}). Give a .csv log or an .npz file.{hint}") from None
 
 
 def _from_npz(
@@ -117,6 +116,10 @@ def _from_npz(
     missing = [name for name in ("time", "position") if name not in arrays]
     missing += [] if {"yaw", "attitude"} & arrays.keys() else ["yaw"]
     missing += ["target_position"] if aim is None and "target_position" not in arrays else []
+    if missing == ["target_position"]:
+        raise BadInput(
+            f"{path}: has no array target_position. Found: {', '.join(arrays)}. Give --target x,y,z,yaw in m and rad."
+        )
     if missing:
         raise BadInput(f"{path}: has no array {', '.join(missing)}. Found: {', '.join(arrays)}. {allowed}")
     for name, values in arrays.items():
@@ -183,6 +186,11 @@ def _read(table: LogTable, chosen: dict[str, Column], say: Say) -> dict[str, np.
             guessed.append(f"{quantity}: nothing says its unit, so it is taken as rad. For degrees, give --columns "
                            f"'{quantity}={column.name}[deg]'")  # fmt: skip
         unit = column.unit or _unit(table, quantity, column, raw) if known else ""
+        if quantity == "time" and not column.unit and unit != "s":
+            guessed.append(
+                f"time: nothing says its unit, so it is taken as {unit}, in which the log has a plausible rate and "
+                f"duration. For another unit, give --columns 'time={column.name}[UNIT]'"
+            )
         chosen[quantity] = Column(column.name, column.index, unit, column.sign)
         values[quantity] = raw * column.sign * known.get(unit, 1.0)
     taken = ", ".join(f"{quantity} = {column}" for quantity, column in chosen.items())
@@ -201,12 +209,7 @@ def _unit(table: LogTable, quantity: str, column: Column, raw: np.ndarray) -> st
     seen = raw[np.isfinite(raw)]
     give = f"Give --columns '{quantity}={column.name}[UNIT]', with one of {', '.join(units_of(quantity))}."
     if quantity == "time":
-        steps = np.diff(seen)
-        step = float(np.median(steps[steps > 0])) if (steps > 0).any() else 0.0
-        for unit, (low, high) in STEPS.items():
-            if low <= step <= high:
-                return unit
-        raise BadInput(f"{table.path}: time: a step of {step:g} from row to row fits no unit for sure. {give}")
+        return _unit_of_time(table.path, seen, give)
     largest = float(np.abs(seen).max()) if seen.size else 0.0
     if quantity.endswith("yaw"):
         if largest > 30 or (largest > 2 * np.pi and np.ptp(seen) > 4 * np.pi):
@@ -217,6 +220,32 @@ def _unit(table: LogTable, quantity: str, column: Column, raw: np.ndarray) -> st
     if largest > FARTHEST:
         raise BadInput(f"{table.path}: {column.name} goes to {largest:.4g}, and nothing says its unit. {give}")
     return "m"
+
+
+def _unit_of_time(path: Path, seen: np.ndarray, give: str) -> str:
+    """The one unit of time in which a log has a plausible rate and duration.
+
+    Raises:
+        BadInput: there is none, or more than one.
+    """
+    steps = np.diff(seen)
+    step = float(np.median(steps[steps > 0])) if (steps > 0).any() else 0.0
+    length = float(np.ptp(seen)) if seen.size else 0.0
+    units = {unit: TIMES[unit] for unit in ("s", "ms", "us", "ns")}
+    fit = [unit for unit, factor in units.items() if step and _is_within(1 / (step * factor), RATES)
+           and _is_within(length * factor, DURATIONS)]  # fmt: skip
+    if len(fit) == 1:
+        return fit[0]
+    near = [unit for unit, factor in units.items() if 1e-5 <= step * factor <= 10]
+    words = "; ".join(
+        f"in {unit} it is {1 / (step * units[unit]):.4g} Hz for {length * units[unit]:.4g} s" for unit in near
+    )
+    told = f" ({words})" if words else ""
+    raise BadInput(f"{path}: time: a step of {step:g} from row to row fits no unit for sure{told}. {give}")
+
+
+def _is_within(value: float, limits: tuple[float, float]) -> bool:
+    return limits[0] * (1 - 1e-6) <= value <= limits[1] * (1 + 1e-6)
 
 
 def _flight(

@@ -49,6 +49,7 @@ def response_text(judged: Mapping[str, Any]) -> str:
     """One judgement for a terminal: its conditions, the response table, and what does not belong to one channel."""
     dial = "".join(f", dial {name} {_shown(value)}" for name, value in (judged.get("dial") or {}).items())
     made_for = f", made for {judged['made_for']}" if judged.get("made_for") else ""
+    made_for += met_words(judged.get("set") or {})
     heading = (
         f"{judged['who']} on {judged['task']} ({judged['vehicle']}{made_for}, world {judged['world']}{dial}): "
         f"{judged['trials']} trials of {judged['duration']:g} s, starts {judged['starts']}, seed {judged['seed']}"
@@ -57,17 +58,24 @@ def response_text(judged: Mapping[str, Any]) -> str:
         trials = "1 flight" if judged["trials"] == 1 else f"{judged['trials']} flights"
         heading = f"{judged['who']}: {trials} of {judged['duration']:g} s, {judged['starts']}"
     crossed = ", ".join(f"{name} {count}" for name, count in judged["violations"].items()) or "none"
-    small = ", ".join(f"{axis} {judged['axes'][axis]['small_steps']}" for axis in AXES)
+    small = {axis: judged["axes"][axis]["small_steps"] for axis in AXES}
     peak, action = judged["peak_speed"], judged["action"]
     footer = [
         f"crashed {judged['crashed']}   infeasible {judged['infeasible']}   trials that crossed a bound: {crossed}",
         f"peak speed {number(peak['median'], 2)} m/s (p95 {number(peak['p95'], 2)})   action rms "
         f"{number(action['rms'], 3)}, total variation {number(action['total_variation'], 4)}   "
         f"efficiency {number(judged['efficiency']['median'], 2)}",
-        f"steps too small for overshoot and rise: {small}",
     ]
+    if any(small.values()):
+        told = ", ".join(f"{axis} {count}" for axis, count in small.items())
+        footer.append(f"steps too small for overshoot and rise: {told}")
     tables = [response_table(judged), *path_tables([judged])]
     return "\n".join([heading, "", *(f"{table.text()}\n" for table in tables), *footer])
+
+
+def met_words(changes: Mapping[str, Any]) -> str:
+    """What a controller met in place of what it was told, for a heading."""
+    return "".join(f", met {path}={value}" for path, value in changes.items())
 
 
 def _shown(setting: Any) -> str:

@@ -21,7 +21,7 @@ from jaxtyping import Float
 
 from flytune.config import document
 from flytune.config.files import write_bytes
-from flytune.control.policy import CONVENTIONS, Policy, limited
+from flytune.control.policy import CONVENTIONS, Policy, conventions, limited
 from flytune.errors import BadInput, require
 from flytune.export.untrusted.onnx_controller import OnnxController, load_onnx, read_onnx, sample_observations
 from flytune.export.untrusted.onnx_inspection import DIAL_INPUT, DIALS, FORMAT, INPUT, OUTPUT, VERSION
@@ -165,7 +165,7 @@ def _model(policy: Policy) -> Any:
     if policy.dials:
         about[DIALS] = json.dumps({name: document.plain(policy.dials[name]) for name in sorted(policy.dials)})
     facts = {FORMAT: FORMAT_VALUE, VERSION: metadata.version("flytune")}
-    helper.set_model_props(model, about | CONVENTIONS | facts)
+    helper.set_model_props(model, about | conventions(policy.about) | facts)
     return model
 
 

@@ -1,6 +1,6 @@
 """The equations of motion of one quadrotor and the step that integrates them (paper R1 to R6, R9)."""
 
-from typing import Any
+import math
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -8,13 +8,11 @@ from jaxtyping import Array, Float
 from flytune.config.pytree import pytree
 from flytune.physics import rotation
 from flytune.physics.components import Components, add, cross, scale, unpack
-from flytune.physics.rotors import thrust_and_torque
-from flytune.physics.vehicle import Vehicle
+from flytune.physics.rotors import commanded_rotor_speed, hover_action, thrust_and_torque
+from flytune.physics.vehicle import TrueVehicle, Vehicle
 
-CONTROL_PERIOD = 0.01  # s (paper R6)
-# per control period; forces and attitude are also evaluated at its middle. More steps are not more accurate in float32
-# (docs/concepts/integrator.md).
-PHYSICS_STEPS = 1
+CONTROL_PERIOD = 0.01  # s; the paper's (R6), and the longest physics step
+RAD_PER_S = 2 * math.pi / 60  # of one rpm
 
 
 @pytree
@@ -29,36 +27,88 @@ class State:
     pending_actions: Float[Array, "latency 4"]  # actions on their way to the motors, oldest first
 
 
+def least_physics_steps(vehicle: Vehicle) -> int:
+    """The physics steps of a control period: one up to 0.01 s.
+
+    Forces and attitude are also evaluated at the middle of a step. More steps are not more accurate in float32
+    (docs/concepts/integrator.md).
+    """
+    return math.ceil(vehicle.control_period / CONTROL_PERIOD - 1e-9)
+
+
 def hovering(vehicle: Vehicle, position: Components, attitude: Components = (0.0, 0.0, 0.0, 1.0)) -> State:
-    """The vehicle at rest with its rotors at hover speed."""
+    """The vehicle at rest with its rotors at hover speed, or at that which its controller was told."""
+    speed = vehicle.hover_rotor_speed_rpm
+    if isinstance(vehicle, TrueVehicle):
+        speed = commanded_rotor_speed(vehicle, hover_action(vehicle))
     return State(
         position=tuple(jnp.asarray(part, float) for part in position),
         attitude=tuple(jnp.asarray(part, float) for part in attitude),
         velocity=tuple(jnp.zeros(3)),
         body_rate=tuple(jnp.zeros(3)),
-        rotor_speed_rpm=tuple(jnp.full(4, vehicle.hover_rotor_speed_rpm, float)),
-        pending_actions=jnp.zeros((vehicle.action_latency_steps, 4)),
+        rotor_speed_rpm=tuple(jnp.full(4, speed, float)),
+        pending_actions=no_pending_actions(vehicle),
     )
 
 
-def commanded_rotor_speed(vehicle: Vehicle, action: Any) -> Any:
-    """The rotor speed in rpm that an action of one motor asks for, within the motor's limits.
+def no_pending_actions(vehicle: Vehicle) -> Float[Array, "latency 4"]:
+    """The actions on their way to the motors of a vehicle that has hovered so far."""
+    return jnp.full((vehicle.action_latency_steps, 4), hover_action(vehicle), float)
 
-        rpm = hover speed * (1 + action_scale * action), from 0 to the maximum
 
-    The action is clipped to [-1, 1]. With an action_scale above 1 a rotor stands still already before action -1.
-
-    Source: paper R9, where action_scale is 1/2.
-    """
-    wanted = vehicle.hover_rotor_speed_rpm * (1 + vehicle.action_scale * jnp.clip(action, -1.0, 1.0))
-    return jnp.clip(wanted, 0.0, vehicle.maximum_rotor_speed_rpm)
+def angular_momentum(vehicle: Vehicle, body_rate: Components) -> Components:
+    """I w in kg m^2/s, body frame."""
+    momentum = tuple(i * w for i, w in zip(vehicle.inertia, body_rate, strict=True))
+    if vehicle.products_of_inertia is None:
+        return momentum
+    (xy, xz, yz), (x, y, z) = vehicle.products_of_inertia, body_rate
+    return add(momentum, (xy * y + xz * z, xy * x + yz * z, xz * x + yz * y))
 
 
 def angular_acceleration(vehicle: Vehicle, body_rate: Components, torque: Components) -> Components:
     """w' = I^-1 (tau - w x I w) in rad/s^2, body frame. Source: paper R3."""
-    momentum = tuple(i * w for i, w in zip(vehicle.inertia, body_rate, strict=True))
-    gyroscopic = cross(body_rate, momentum)
-    return tuple((t - g) / i for t, g, i in zip(torque, gyroscopic, vehicle.inertia, strict=True))
+    gyroscopic = cross(body_rate, angular_momentum(vehicle, body_rate))
+    if vehicle.products_of_inertia is None:
+        return tuple((t - g) / i for t, g, i in zip(torque, gyroscopic, vehicle.inertia, strict=True))
+    (xx, yy, zz), (xy, xz, yz) = vehicle.inertia, vehicle.products_of_inertia
+    # the inverse of a symmetric matrix by its cofactors, whose sum with a row is the determinant
+    first = (yy * zz - yz * yz, xz * yz - xy * zz, xy * yz - xz * yy)
+    second = (first[1], xx * zz - xz * xz, xy * xz - xx * yz)
+    third = (first[2], second[2], xx * yy - xy * xy)
+    determinant = xx * first[0] + xy * first[1] + xz * first[2]
+    left = add(torque, scale(-1, gyroscopic))
+    return tuple(sum(c * t for c, t in zip(row, left, strict=True)) / determinant for row in (first, second, third))
+
+
+def body_drag(vehicle: Vehicle, attitude: Components, velocity: Components, rotor_speed_rpm: Components) -> Components:
+    """The drag along the body's axes, seen in the inertial frame, in N.
+
+        F_i = -(d_i + k_i sum of rotor speeds + c_i |v_i|) v_i  along each axis i of the body
+
+    with the vehicle's `body_drag` d, `rotor_drag` k and `quadratic_drag` c.
+
+    Args:
+        vehicle: its coefficients.
+        attitude: body to inertial.
+        velocity: in m/s, inertial frame.
+        rotor_speed_rpm: of each rotor.
+
+    Source: Forster 2015 (rotors); Faessler, Franchi and Scaramuzza, IEEE RA-L 2018 (linear in the body frame).
+    """
+    along = rotation.rotate(rotation.conjugate(attitude), velocity)
+    resistance = [vehicle.body_drag[axis] if vehicle.body_drag is not None else 0.0 for axis in range(3)]
+    if vehicle.rotor_drag is not None:
+        turning = RAD_PER_S * sum(rotor_speed_rpm[1:], start=rotor_speed_rpm[0])
+        resistance = [r + k * turning for r, k in zip(resistance, vehicle.rotor_drag, strict=True)]
+    if vehicle.quadratic_drag is not None:
+        squares = zip(resistance, vehicle.quadratic_drag, along, strict=True)
+        resistance = [r + c * jnp.abs(v) for r, c, v in squares]
+    return rotation.rotate(attitude, tuple(-r * v for r, v in zip(resistance, along, strict=True)))
+
+
+def has_body_drag(vehicle: Vehicle) -> bool:
+    """Whether a vehicle has drag along its own axes."""
+    return any(each is not None for each in (vehicle.body_drag, vehicle.rotor_drag, vehicle.quadratic_drag))
 
 
 def rotor_speed_after(vehicle: Vehicle, now: Components, commanded: Components, elapsed: float) -> Components:
@@ -81,15 +131,22 @@ def rotor_speed_after(vehicle: Vehicle, now: Components, commanded: Components, 
     )
 
 
-def step(vehicle: Vehicle, state: State, action: Float[Array, "4"], physics_steps: int = PHYSICS_STEPS) -> State:
-    """The state one control period (0.01 s) later, under one action in [-1, 1]^4.
+def step(vehicle: Vehicle, state: State, action: Float[Array, "4"], physics_steps: int | None = None) -> State:
+    """The state one control period later, under one action in [-1, 1]^4.
 
     The motors receive the action after the latency.
+
+    Args:
+        vehicle: its numbers.
+        state: the state now.
+        action: of each motor.
+        physics_steps: of the control period; `least_physics_steps` where None.
     """
+    physics_steps = physics_steps or least_physics_steps(vehicle)
     queue = jnp.concatenate([state.pending_actions, action[None]])
     commanded = tuple(commanded_rotor_speed(vehicle, motor) for motor in unpack(queue[0]))
     body = (state.position, state.attitude, state.velocity, state.body_rate)
-    rotors, duration = state.rotor_speed_rpm, CONTROL_PERIOD / physics_steps
+    rotors, duration = state.rotor_speed_rpm, vehicle.control_period / physics_steps
     for _ in range(physics_steps):
         speeds = [rotor_speed_after(vehicle, rotors, commanded, t) for t in (0.0, duration / 2, duration)]
         body, rotors = _physics_step(vehicle, body, speeds, duration), speeds[-1]
@@ -142,6 +199,9 @@ def _physics_step(
         add(scale(thrust / vehicle.mass, rotation.vertical_axis(attitude)), weight)
         for (thrust, _), attitude in zip(forces, (q, q_middle, q_end), strict=True)
     )
+    if has_body_drag(vehicle):
+        moved, v_end = _moved_against_drag(vehicle, v, (a0, a1, a2), (q, q_middle, q_end), rotor_speeds, h)
+        return add(p, moved), q_end, v_end, w_end
     drag = tuple(coefficient / vehicle.mass for coefficient in vehicle.drag)
     undragged = add(scale(h, v), scale(h**2 / 6, add(a0, scale(2, a1))))
     slowed = add(scale(h**2 / 2, v), scale(h**3 / 6, add(a0, tuple(-d * c for d, c in zip(drag, v, strict=True)))))
@@ -152,3 +212,35 @@ def _physics_step(
         tuple(-d * m for d, m in zip(drag, moved, strict=True)),  # drag is linear: its integral is -D times the way
     )
     return add(p, moved), q_end, v_end, w_end
+
+
+def _moved_against_drag(
+    vehicle: Vehicle,
+    velocity: Components,
+    accelerations: tuple[Components, Components, Components],
+    attitudes: tuple[Components, Components, Components],
+    rotor_speeds: list[Components],
+    h: float,
+) -> tuple[Components, Components]:
+    """The way in m and the velocity in m/s after h seconds by classical Runge-Kutta, with every kind of drag.
+
+    Args:
+        vehicle: its drag.
+        velocity: at the start.
+        accelerations: from thrust and gravity, at the start, the middle and the end of the step.
+        attitudes: likewise.
+        rotor_speeds: likewise, in rpm.
+        h: length of the step in s.
+    """
+
+    def acceleration(instant: int, v: Components) -> Components:
+        inertial = tuple(-d * part for d, part in zip(vehicle.drag, v, strict=True))
+        force = add(inertial, body_drag(vehicle, attitudes[instant], v, rotor_speeds[instant]))
+        return add(accelerations[instant], scale(1 / vehicle.mass, force))
+
+    k1 = acceleration(0, velocity)
+    k2 = acceleration(1, add(velocity, scale(h / 2, k1)))
+    k3 = acceleration(1, add(velocity, scale(h / 2, k2)))
+    k4 = acceleration(2, add(velocity, scale(h, k3)))
+    moved = add(scale(h, velocity), scale(h**2 / 6, add(k1, k2, k3)))
+    return moved, add(velocity, scale(h / 6, add(k1, scale(2, k2), scale(2, k3), k4)))

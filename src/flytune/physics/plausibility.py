@@ -42,6 +42,14 @@ class Figure:
         low, high = (max(each, 1e-12) for each in self.usual)
         return max(0.0, math.log(low / max(self.value, 1e-12)), math.log(max(self.value, 1e-12) / high))
 
+    @property
+    def described(self) -> str:
+        """Its value with what is allowed and what is usual, in words."""
+        return (
+            f"{self.name} is {_number(self.value)}{self.unit}. Allowed: {_number(self.lowest)} to "
+            f"{_number(self.highest)}{self.unit} (usual: {self.usual[0]:g} to {self.usual[1]:g})"
+        )
+
     def __str__(self) -> str:
         return f"{self.name} {_number(self.value)}{self.unit}"
 
@@ -57,8 +65,9 @@ def figures(vehicle: Vehicle) -> list[Figure]:
     gyration = [math.sqrt(moment / mass) / arm for moment in vehicle.inertia]
     hover = vehicle.hover_rotor_speed_rpm
     tip = hover * RAD_PER_S * radius
-    ratio = vehicle.torque_coefficient / vehicle.thrust_coefficient
-    coefficient = vehicle.thrust_coefficient * 60**2 / (AIR_DENSITY * (2 * radius) ** 4)
+    ratio = torque_over_thrust(vehicle)
+    # of the quadratic curve through the thrust at hover
+    coefficient = mass * vehicle.gravity / 4 / hover**2 * 60**2 / (AIR_DENSITY * (2 * radius) ** 4)
     found = [
         Figure(name="mass", value=mass, lowest=0.003, highest=100, usual=(0.02, 25), of="mass", unit=" kg"),
         Figure(name="arm", value=arm, lowest=0.008, highest=3, usual=(0.02, 0.6), of="arm", unit=" m"),
@@ -83,11 +92,12 @@ def figures(vehicle: Vehicle) -> list[Figure]:
             usual=(0.1, 0.35), of="torque_coefficient, thrust_coefficient, propeller_radius", unit=" propeller radii",
         ),
         Figure(
-            name=f"{LIFT} of the motors", value=(vehicle.maximum_rotor_speed_rpm / hover) ** 2,
-            lowest=LEAST_LIFT, highest=25, usual=(1.3, 12), of="maximum_rotor_speed_rpm, mass, thrust_coefficient",
+            name=f"{LIFT} of the motors",
+            value=vehicle.square_of_speed(vehicle.top_rotor_speed_rpm) / vehicle.hover_square, lowest=LEAST_LIFT,
+            highest=25, usual=(1.3, 12), of="maximum_rotor_speed_rpm, mass, thrust_coefficient",
         ),
         Figure(
-            name=f"{LIFT} at full action", value=vehicle.thrust_to_weight, lowest=LEAST_LIFT, highest=25,
+            name=f"{LIFT} at full action", value=vehicle.full_thrust_to_weight, lowest=LEAST_LIFT, highest=25,
             usual=(1.3, 12), of="action_scale, maximum_rotor_speed_rpm, mass, thrust_coefficient",
         ),
         Figure(
@@ -95,26 +105,39 @@ def figures(vehicle: Vehicle) -> list[Figure]:
             of="drag, mass", unit=" 1/s",
         ),
     ]  # fmt: skip
-    if vehicle.rotor_drag is not None:
-        slowing = max(vehicle.rotor_drag) * 4 * hover * RAD_PER_S / mass
-        found.append(
-            Figure(
-                name="rotor drag at hover over mass", value=slowing, lowest=0, highest=20, usual=(0.05, 1),
-                of="rotor_drag, mass, thrust_coefficient", unit=" 1/s",
-            )
-        )  # fmt: skip
+    slowing = {  # the rate in 1/s at which each kind of drag slows the vehicle; the quadratic one at 10 m/s
+        "rotor_drag": ("rotor drag at hover over mass", 4 * hover * RAD_PER_S),
+        "optional_rotor_drag": ("optional rotor drag at hover over mass", 4 * hover * RAD_PER_S),
+        "body_drag": ("body drag over mass", 1.0),
+        "quadratic_drag": ("quadratic drag at 10 m/s over mass", 10.0),
+    }
+    for field, (name, factor) in slowing.items():
+        if (values := getattr(vehicle, field)) is not None:
+            found.append(
+                Figure(
+                    name=name, value=max(values) * factor / mass, lowest=0, highest=20, usual=(0.05, 1),
+                    of=f"{field}, mass", unit=" 1/s",
+                )
+            )  # fmt: skip
     return found
+
+
+def torque_over_thrust(vehicle: Vehicle) -> float:
+    """The drag torque of a rotor over its thrust at hover, in m, of a vehicle with plain numbers."""
+    hover = vehicle.hover_rotor_speed_rpm
+    torque = vehicle.torque_coefficient * hover**2 + (vehicle.torque_linear or 0.0) * hover
+    return torque / (vehicle.mass * vehicle.gravity / 4)
 
 
 def summary(vehicle: Vehicle) -> str:
     """The figures that a person checks first, in one line."""
     gyration = ", ".join(_number(math.sqrt(each / vehicle.mass) / reach_of(vehicle)) for each in vehicle.inertia)
-    ratio = 1000 * vehicle.torque_coefficient / vehicle.thrust_coefficient
+    ratio = 1000 * torque_over_thrust(vehicle)
     hover = vehicle.hover_rotor_speed_rpm
     coefficient = next(each for each in figures(vehicle) if each.name.startswith("thrust coefficient"))
     return (
         f"hovers at {hover:.0f} rpm (propeller tips at {hover * RAD_PER_S * vehicle.propeller_radius:.0f} m/s); "
-        f"thrust to weight {vehicle.thrust_to_weight:.3g}; torque over thrust {ratio:.3g} mm; "
+        f"thrust to weight {vehicle.full_thrust_to_weight:.3g}; torque over thrust {ratio:.3g} mm; "
         f"radius of gyration over arm {gyration} (x, y, z); {coefficient}"
     )
 
@@ -132,29 +155,37 @@ def implausible(vehicle: Vehicle) -> str | None:
         first = wrong[0]
         if first.name.startswith(LIFT):
             return (
-                _too_weak(vehicle) if first.value < first.lowest else f"{first.of}: {_shown(first)}. Check the units."
+                _too_weak(vehicle) if first.value < first.lowest else f"{first.of}: {first.described}. Check the units."
             )
-        return f"{first.of}: not plausible: {_shown(first)}. Check the units."
+        return f"{first.of}: not plausible: {first.described}. Check the units."
     first = next(each for each in wrong if each.name not in left)
     names = ", ".join(_field(vehicle, name) for name in slip.fields)
     values = ", ".join(_value(vehicle, name) for name in slip.fields)
     write = ", ".join(f"{_field(vehicle, name)} = {_value(changed, name)}" for name in slip.fields)
     are, they = ("is", "Is it") if len(slip.fields) == 1 else ("are", "Are they")
-    return f"{names}: {values} {are} not plausible: {_shown(first)}. {they} in {slip.unit}? Then write {write}."
+    # a propeller of 10 inches has a radius of 12.7 cm: a number of 10 may mean this, or a radius of 10 cm
+    near = (
+        f", or {_value(other, each.fields[0])} if it is {each.words}"
+        for each, other in _repaired(vehicle)
+        if each is not slip and each.fields == slip.fields == ("propeller_radius",) and not _wrong(other)
+        and abs(math.log(each.factors[0] / slip.factors[0])) < math.log(1.5)
+    )  # fmt: skip
+    write += "".join(near)
+    return f"{names}: {values} {are} not plausible: {first.described}. {they} {slip.words}? Then write {write}."
 
 
 def _too_weak(vehicle: Vehicle) -> str:
     """The line for a vehicle that cannot lift itself."""
     hover = vehicle.hover_rotor_speed_rpm
     least = math.sqrt(LEAST_LIFT)
-    if vehicle.maximum_rotor_speed_rpm < least * hover:
+    if vehicle.maximum_rotor_speed_rpm is not None and vehicle.maximum_rotor_speed_rpm < least * hover:
         return (
             f"maximum_rotor_speed_rpm: {_rounded(vehicle.maximum_rotor_speed_rpm)} cannot lift the vehicle. "
             f"Allowed: above the hover speed, {hover:.0f} rpm, by 1 % or more."
         )
     return (
-        f"action_scale: {_rounded(vehicle.action_scale)} cannot lift the vehicle: full action gives "
-        f"{vehicle.thrust_to_weight:.3g} times its weight. Allowed: {least - 1:.2g} or more."
+        f"action_scale: {_rounded(vehicle.action_scale or 0.0)} cannot lift the vehicle: full action gives "
+        f"{vehicle.full_thrust_to_weight:.3g} times its weight. Allowed: {least - 1:.2g} or more."
     )
 
 
@@ -165,12 +196,20 @@ class _Slip:
     fields: tuple[str, ...]
     unit: str
     factors: tuple[float, ...]
+    diameter: bool = False  # given in place of a radius
+
+    @property
+    def words(self) -> str:
+        """What the number is then, for a question."""
+        return f"the diameter in {self.unit}" if self.diameter else f"in {self.unit}"
 
 
 _RPM = 1 / RAD_PER_S  # in one rad/s
 _SLIPS = (
     *(_Slip((name,), unit, (factor,)) for name in ("arm", "propeller_radius")
       for unit, factor in (("mm", 1e-3), ("cm", 1e-2), ("inches", 0.0254))),
+    *(_Slip(("propeller_radius",), unit, (factor / 2,), diameter=True)
+      for unit, factor in (("mm", 1e-3), ("cm", 1e-2), ("inches", 0.0254), ("m", 1.0))),
     *(_Slip(("arm", "propeller_radius"), unit, (factor, factor))
       for unit, factor in (("mm", 1e-3), ("cm", 1e-2), ("inches", 0.0254))),
     _Slip(("mass",), "g", (1e-3,)),
@@ -203,6 +242,8 @@ _SLIPS = (
 def _repaired(vehicle: Vehicle) -> Iterator[tuple[_Slip, Any]]:
     """The vehicle as it is meant, for each slip."""
     for slip in _SLIPS:
+        if any(getattr(vehicle, name) is None for name in slip.fields if name != "arm"):
+            continue
         changes: dict[str, Any] = {}
         for name, factor in zip(slip.fields, slip.factors, strict=True):
             if name == "arm" and vehicle.rotors is not None:
@@ -242,13 +283,6 @@ def _value(vehicle: Vehicle, name: str) -> str:
 
 def _rounded(value: float) -> float:
     return float(f"{value:.6g}")
-
-
-def _shown(figure: Figure) -> str:
-    return (
-        f"{figure.name} is {_number(figure.value)}{figure.unit}. Allowed: {_number(figure.lowest)} to "
-        f"{_number(figure.highest)}{figure.unit} (usual: {figure.usual[0]:g} to {figure.usual[1]:g})"
-    )
 
 
 def _number(value: float) -> str:

@@ -4,7 +4,7 @@ from typing import Any
 
 import jax.numpy as jnp
 
-from flytune.physics.components import Components, scale, squared_norm
+from flytune.physics.components import Components, add, cross, scale, squared_norm
 
 
 def multiply(first: Components, second: Components) -> Components:
@@ -40,6 +40,13 @@ def exponential(rotation: Components) -> Components:
     sine = 0.5 * (1 - squared / 6 * (1 - squared / 20 * (1 - squared / 42)))
     cosine = 1 - squared / 2 * (1 - squared / 12 * (1 - squared / 30 * (1 - squared / 56)))
     return (*scale(sine, rotation), cosine)
+
+
+def rotate(quaternion: Components, vector: Components) -> Components:
+    """A vector of three, turned by a unit quaternion: v + 2 w (u x v) + 2 u x (u x v), u its vector part."""
+    axis, w = quaternion[:3], quaternion[3]
+    turned = scale(2, cross(axis, vector))
+    return add(vector, scale(w, turned), cross(axis, turned))
 
 
 def vertical_axis(quaternion: Components) -> Components:

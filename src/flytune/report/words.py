@@ -10,6 +10,7 @@ from flytune.config import document, nested
 from flytune.evaluation.evaluate import Evaluation
 from flytune.evaluation.judge import AXES, Judgement
 from flytune.evaluation.statistics import median
+from flytune.evaluation.table import met_words
 from flytune.report.style import listed
 from flytune.tables import NULL, Column, Table, number
 from flytune.task.files import write_task
@@ -50,6 +51,7 @@ def facts(judgement: Judgement, speed_bound: float | None) -> dict[str, str]:
         "flown": f"{judgement.trials} trials of {judgement.duration:g} s, starts {judgement.initial_conditions}, "
         f"seed {judgement.seed}, vehicle {judgement.vehicle}"
         + (f" (made for {judgement.made_for})" if judgement.made_for else "")
+        + met_words(judgement.changes)
         + f", world {judgement.simulator}",
     }
 

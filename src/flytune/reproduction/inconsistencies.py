@@ -114,7 +114,7 @@ def _mean_rotor_speed(evidence: Evidence) -> list[Measure]:
 
 def _thrust(evidence: Evidence) -> list[Measure]:
     return [
-        Measure(what=f"thrust-to-weight ratio of {name}", value=float(load_vehicle(name).thrust_to_weight))
+        Measure(what=f"thrust-to-weight ratio of {name}", value=float(load_vehicle(name).full_thrust_to_weight))
         for name in ("crazyflie", "crazyflie-measured")
     ]
 

@@ -2,6 +2,7 @@
 
 import json
 from importlib import resources
+from pathlib import Path
 from typing import Any
 
 from flytune.physics.vehicle import vehicle_names
@@ -21,6 +22,14 @@ def catalogue() -> dict[str, dict[str, str]]:
         "policies": {name: _training(name) for name in shipped_names()},
         "controllers": {name: _first_sentence("flytune.control", "gains", name) for name in classical},
         "simulators": SIMULATORS,
+    }
+
+
+def folders() -> dict[str, Path]:
+    """Kind -> the folder of the files that ship, of those kinds whose files are worth a copy."""
+    return {
+        "presets": Path(str(resources.files("flytune.task") / "presets")),
+        "vehicles": Path(str(resources.files("flytune.physics") / "vehicles")),
     }
 
 

@@ -19,6 +19,7 @@ import safetensors.numpy
 
 from flytune.config import document, nested
 from flytune.config.files import RUN_FILES, make_folder, write_bytes, write_json, write_text
+from flytune.config.recognise import runs_in
 from flytune.control.policy import Policy, save_policy
 from flytune.errors import BadInput
 from flytune.task.files import load_task, write_task
@@ -158,6 +159,7 @@ def read_facts(directory: Path) -> dict[str, Any]:
     except OSError:
         raise BadInput(
             f"{directory}: is not a run directory (no run.json). Give one that `flytune train` wrote."
+            f"{runs_in(directory)}"
         ) from None
     except ValueError:
         raise BadInput(f"{path}: is damaged. Train again into another directory.") from None

@@ -10,6 +10,7 @@ from typing import Any
 import jax
 
 from flytune.config import document, nested
+from flytune.config.recognise import CONTROLLER, meant, misplaced
 from flytune.control.classical import CLASSICAL, classical_controller
 from flytune.control.controller import Controller
 from flytune.control.policy import Policy, load_policy
@@ -73,6 +74,13 @@ class FoundController:
                 "`flytune train dial` trains one."
             )
         schedule = dict(schedule)
+        names = [*controller.dials, SETTLING_TIME]
+        if unknown := next((each for each in schedule if each not in names), None):
+            hint = document.nearest(unknown, names)
+            raise BadInput(
+                f"dial: {unknown!r} is no dial here. Allowed: {', '.join(names)}."
+                + (f" Did you mean {hint}?" if hint else "")
+            )
         if SETTLING_TIME in schedule and SETTLING_TIME not in controller.dials:
             self._check_measured_on_this_vehicle()
             schedule |= _by_settling_time(self.name, controller, schedule.pop(SETTLING_TIME), schedule)
@@ -143,6 +151,10 @@ def find_controller(name: str, task: str | Task | None = None) -> FoundControlle
     path = Path(name)
     if os.path.isdir(name):  # unlike Path.is_dir, also where the name is too long to be one
         return _from_run(name, path, wanted)
+    if line := misplaced(name, CONTROLLER):
+        raise BadInput(line)
+    if path.suffix in READERS and not os.path.exists(name) and (hint := meant(name, CONTROLLER, [], READERS)):
+        raise BadInput(f"{name}: no such file.{hint}")
     if path.suffix in READERS or os.path.isfile(name):
         return _from_file(name, path, wanted)
     kind, at, gains = name.partition("@")
@@ -153,7 +165,10 @@ def find_controller(name: str, task: str | Task | None = None) -> FoundControlle
         return FoundController(name=name, controller=controller, task=wanted, about=about)
     if name in shipped_names():
         return _shipped(name, wanted)
-    raise BadInput(f"{name}: no such controller. Allowed: {KINDS}{''.join(f', {name}' for name in shipped_names())}.")
+    hint = meant(name, CONTROLLER, [*CLASSICAL, *shipped_names()], READERS)
+    raise BadInput(
+        f"{name}: no such controller. Allowed: {KINDS}{''.join(f', {each}' for each in shipped_names())}.{hint}"
+    )
 
 
 def fixed_policy(policy: Policy, task: Task) -> Policy:

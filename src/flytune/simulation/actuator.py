@@ -6,6 +6,7 @@ The equations are those of `physics.dynamics`, repeated because a simulator in C
 import numpy as np
 from jaxtyping import Float
 
+from flytune.physics.rotors import commanded_rotor_speed, hover_action
 from flytune.physics.vehicle import Vehicle
 
 
@@ -14,29 +15,23 @@ class Actuator:
 
     def __init__(self, vehicle: Vehicle, number: int) -> None:
         self._vehicle = vehicle
-        hover = float(vehicle.hover_rotor_speed_rpm)
+        hover = float(commanded_rotor_speed(vehicle, hover_action(vehicle), np))
         self.rotor_speed_rpm: Float[np.ndarray, "N 4"] = np.full((number, 4), hover)
         self._commanded = np.full((number, 4), hover)
-        self._pending = np.zeros((number, vehicle.action_latency_steps, 4))  # oldest first
+        self._hover = float(hover_action(vehicle))
+        self._pending = np.full((number, vehicle.action_latency_steps, 4), self._hover)  # oldest first
 
     def place(self, rotor_speed_rpm: Float[np.ndarray, "K 4"], which: np.ndarray | None = None) -> None:
         """Set the rotor speeds, with no pending action; see `Simulator.place`."""
         chosen = slice(None) if which is None else which
         self.rotor_speed_rpm[chosen] = rotor_speed_rpm
-        self._pending[chosen] = 0.0
+        self._pending[chosen] = self._hover
 
     def command(self, action: Float[np.ndarray, "N 4"]) -> None:
-        """Accept the actions of a control period; those that the latency has delayed until now move the motors.
-
-            rpm = clip(hover speed * (1 + action_scale * clip(action, -1, 1)), 0, maximum)
-
-        Source: paper R9.
-        """
+        """Accept the actions of a control period; those that the latency has delayed until now move the motors."""
         queue = np.concatenate([self._pending, np.asarray(action, float)[:, None]], axis=1)
         now, self._pending = queue[:, 0], queue[:, 1:]
-        vehicle = self._vehicle
-        wanted = vehicle.hover_rotor_speed_rpm * (1 + vehicle.action_scale * np.clip(now, -1.0, 1.0))
-        self._commanded = np.clip(wanted, 0.0, vehicle.maximum_rotor_speed_rpm)
+        self._commanded = np.asarray(commanded_rotor_speed(self._vehicle, now, np))
 
     def turn(self, duration: float) -> Float[np.ndarray, "N 4"]:
         """The rotor speeds in rpm at the middle of the next `duration` seconds, which are simulated.

@@ -1,14 +1,14 @@
-"""Ground effect and rotor drag, as the paper's simulator models them. NumPy, float64."""
+"""Ground effect, and drag along the body's axes. NumPy, float64."""
 
 import numpy as np
 from jaxtyping import Float
 
+from flytune.physics.dynamics import RAD_PER_S
 from flytune.physics.rotors import places
 from flytune.physics.vehicle import Vehicle
-from flytune.simulation.simulator import rotation_matrix, to_body, to_inertial
+from flytune.simulation.simulator import rotation_matrix, to_body
 
 LARGEST_GROUND_EFFECT = 4 / 15  # of the thrust: at gym-pybullet-drones' lowest height, r sqrt(15 k / 4) / 4
-RAD_PER_S = 2 * np.pi / 60  # of one rpm
 TINY = 1e-9  # m, where a vehicle without ground effect stands on the floor
 
 
@@ -32,20 +32,23 @@ def ground_effect(
     return np.where(upwards[:, 2:] > 0, gain, 0.0)
 
 
-def rotor_drag(
+def drag(
     vehicle: Vehicle,
     attitude: Float[np.ndarray, "N 4"],
     velocity: Float[np.ndarray, "N 3"],
     rotor_speed_rpm: Float[np.ndarray, "N 4"],
 ) -> Float[np.ndarray, "N 3"]:
-    """The drag of turning propellers in N, inertial frame: -K (sum of rotor speeds) v, K along the body's axes.
+    """The drag along the body's axes in N, body frame; `physics.dynamics.body_drag` has the equation.
 
-    K is the vehicle's `rotor_drag` in kg/rad, 0 where it has none.
-
-    Source: Forster, System Identification of the Crazyflie 2.0 Nano Quadrocopter, ETH Zurich 2015.
-    gym-pybullet-drones applies the coefficients along the inertial axes instead.
+    Args:
+        vehicle: its coefficients, 0 where it has none.
+        attitude: body to inertial.
+        velocity: in m/s, inertial frame.
+        rotor_speed_rpm: of each rotor.
     """
-    turning = RAD_PER_S * rotor_speed_rpm.sum(axis=-1, keepdims=True)
-    return to_inertial(
-        attitude, -np.array(vehicle.rotor_drag or (0.0, 0.0, 0.0)) * turning * to_body(attitude, velocity)
+    along = to_body(attitude, velocity)
+    linear, turning, quadratic = (
+        np.array(each or (0.0, 0.0, 0.0)) for each in (vehicle.body_drag, vehicle.rotor_drag, vehicle.quadratic_drag)
     )
+    speed = RAD_PER_S * rotor_speed_rpm.sum(axis=-1, keepdims=True)
+    return -(linear + turning * speed + quadratic * np.abs(along)) * along

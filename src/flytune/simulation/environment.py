@@ -17,9 +17,11 @@ from flytune.config.pytree import pytree
 from flytune.physics import dynamics
 from flytune.physics.dynamics import State
 from flytune.physics.rotation import safe_norm
+from flytune.physics.rotors import hover_action
 from flytune.physics.vehicle import Vehicle
 from flytune.simulation import CRASH_DISTANCE
 from flytune.task import observation
+from flytune.task.observation import RATE
 from flytune.task.reward import rewards
 from flytune.task.situation import position_error, situation
 from flytune.task.task import Task, TaskFamily
@@ -33,7 +35,7 @@ class Episode:
     """The state of an episode."""
 
     state: State
-    last_action: Float[Array, "4"]  # the clipped action before; hover (0) after a reset
+    last_action: Float[Array, "4"]  # the clipped action before; after a reset the one that hovers
     steps: Int[Array, ""]  # control steps since the start; -1 in an episode that is held after a crash
     reward: Float[Array, ""]  # sum since the start
     numbers: Any = ()  # of the task's family, drawn for this episode
@@ -51,11 +53,11 @@ class Outcome:
     truncated: Bool[Array, ""]  # the horizon is reached; what would come after still counts
 
 
-def begin(state: State, numbers: Any = ()) -> Episode:
-    """An episode that starts in a state, with the hover action (0) as its last one."""
+def begin(vehicle: Vehicle, state: State, numbers: Any = ()) -> Episode:
+    """An episode that starts in a state, with the hover action as its last one."""
     return Episode(
         state=state,
-        last_action=jnp.zeros(4),
+        last_action=jnp.full(4, hover_action(vehicle), float),
         steps=jnp.zeros((), jnp.int32),
         reward=jnp.zeros(()),
         numbers=numbers,
@@ -66,13 +68,13 @@ def reset(family: TaskFamily, key: jax.Array) -> Episode:
     """A new episode: the family draws its numbers, and the task its initial state."""
     numbers, key = family.draw(key)
     task = family.member(numbers)
-    return begin(task.initial_state.draw(task.vehicle, task.target, key), numbers)
+    return begin(task.vehicle, task.initial_state.draw(task.vehicle, task.target, key), numbers)
 
 
 def observe(task: Task, episode: Episode, normal: Float[Array, "13"]) -> Float[Array, "17"]:
     """The noisy observation of an episode, for 13 standard normal numbers."""
-    target = task.reference(episode.steps)
-    return observation.observe(target, task.noise, episode.state, episode.last_action, normal)
+    noise = task.noise.at_rate(task.vehicle.control_rate)
+    return observation.observe(task.reference(episode.steps), noise, episode.state, episode.last_action, normal)
 
 
 def see(family: TaskFamily, episode: Episode, normal: Float[Array, "13"]) -> Float[Array, "_"]:
@@ -94,8 +96,10 @@ def step(
 def assess(task: Task, episode: Episode, state: State, action: Float[Array, "4"]) -> tuple[Episode, Outcome]:
     """The episode in the state that a clipped action led to, and the result of the step, for any simulator."""
     steps = episode.steps + 1
-    here = situation(task.reference(steps), state, action - episode.last_action)
+    here = situation(task.reference(steps), state, per_unit_time(task.vehicle, action - episode.last_action))
     terms = rewards(task.reward, here)
+    if task.vehicle.control_rate != RATE:  # so that the same flight earns the same in the same time
+        terms = {name: term * (RATE / task.vehicle.control_rate) for name, term in terms.items()}
     left = margins(task.termination, here)
     why = cause(left)
     terminated = why != SAFE
@@ -105,10 +109,20 @@ def assess(task: Task, episode: Episode, state: State, action: Float[Array, "4"]
         margins=left,
         cause=why,
         terminated=terminated,
-        truncated=(steps >= task.horizon) & ~terminated,
+        truncated=(steps >= horizon(task)) & ~terminated,
     )
     reward = episode.reward + outcome.reward
     return dataclasses.replace(episode, state=state, last_action=action, steps=steps, reward=reward), outcome
+
+
+def horizon(task: Task) -> Any:
+    """The control steps after which a training episode is truncated."""
+    return task.horizon if task.vehicle.control_rate == RATE else task.horizon * (task.vehicle.control_rate / RATE)
+
+
+def per_unit_time(vehicle: Vehicle, change: Float[Array, "4"]) -> Float[Array, "4"]:
+    """The change of an action in one control period, as a change in 0.01 s."""
+    return change if vehicle.control_rate == RATE else change * (vehicle.control_rate / RATE)
 
 
 def with_slack(task: Task, moved: Episode, outcome: Outcome, slack: Any) -> Outcome:
@@ -121,7 +135,7 @@ def with_slack(task: Task, moved: Episode, outcome: Outcome, slack: Any) -> Outc
     """
     beyond = cause({name: margin + slack * task.termination[name].slack for name, margin in outcome.margins.items()})
     terminated = beyond != SAFE
-    truncated = (moved.steps >= task.horizon) & ~terminated
+    truncated = (moved.steps >= horizon(task)) & ~terminated
     return dataclasses.replace(outcome, cause=beyond, terminated=terminated, truncated=truncated)
 
 
@@ -171,6 +185,6 @@ def margins_along(
 
     def one(numbers: Any, state: State, change: Array, steps: Array) -> dict[str, Array]:
         here = task.member(numbers)
-        return margins(here.termination, situation(here.reference(steps), state, change))
+        return margins(here.termination, situation(here.reference(steps), state, per_unit_time(here.vehicle, change)))
 
     return jax.vmap(one)(settings, states, changes, steps)

@@ -19,7 +19,8 @@ from jaxtyping import Array, Float
 
 from flytune.errors import BadInput
 from flytune.kernels.batched import batched
-from flytune.physics.dynamics import hovering
+from flytune.physics.dynamics import hovering, no_pending_actions
+from flytune.physics.rotors import hover_action
 from flytune.simulation import environment
 from flytune.simulation.environment import Episode
 from flytune.simulation.rollout import reset_all
@@ -122,6 +123,7 @@ class HostEnvironment:
         self.task, self.number, self.simulator = task, number, simulator
         self._numbers, self._structure = _packed(task)
         self._ending = ending
+        self._hover = float(hover_action(task.vehicle))
         self._terms = tuple(sorted(task.reward))
         self.key: Any = None  # of noise and new episodes, where `step` is given none
         self.episodes: Any = np.zeros((0, number), np.float32)  # [K, N], see `unravel`
@@ -170,7 +172,7 @@ class HostEnvironment:
         physics, reached = self.simulator.physics, None
         action = np.asarray(action, np.float32)
         if physics is None:
-            self.simulator.advance(np.where(self._parked[:, None], 0.0, action))
+            self.simulator.advance(np.where(self._parked[:, None], self._hover, action))
             reached = self.simulator.states().rows().astype(np.float32).T
         how = (self._structure, self._ending, physics)
         key = self.key if noise is None or self._ending == "restart" else None
@@ -223,8 +225,8 @@ def episodes_at(task: Task, states: Float[Array, "17 N"]) -> Array:
     """Episodes [K, N] that begin in given states."""
 
     def one(numbers: Array) -> Episode:
-        pending = jnp.zeros((task.vehicle.action_latency_steps, 4))
-        return environment.begin(state_from(numbers, pending))
+        pending = no_pending_actions(task.vehicle)
+        return environment.begin(task.vehicle, state_from(numbers, pending))
 
     return ravel(jax.vmap(one, in_axes=-1, out_axes=-1)(states))
 

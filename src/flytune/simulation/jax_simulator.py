@@ -12,7 +12,8 @@ from flytune.config.document import Whole
 from flytune.config.pytree import pytree, static
 from flytune.kernels.programs import program
 from flytune.physics import dynamics
-from flytune.physics.dynamics import PHYSICS_STEPS, State
+from flytune.physics.dynamics import State
+from flytune.physics.rotors import hover_action
 from flytune.physics.vehicle import Vehicle
 from flytune.simulation.environment import Physics
 from flytune.simulation.simulator import VehicleStates, state_from, state_numbers
@@ -22,7 +23,8 @@ from flytune.simulation.simulator import VehicleStates, state_from, state_number
 class JaxSimulatorOptions:
     """How finely the physics is stepped."""
 
-    physics_steps: Annotated[Whole, Ge(1), Le(100), Unit("per control period")] = static(default=PHYSICS_STEPS)
+    # None: steps of up to 0.01 s
+    physics_steps: Annotated[Whole | None, Ge(1), Le(100), Unit("per control period")] = static(default=None)
 
 
 class JaxSimulator:
@@ -35,13 +37,14 @@ class JaxSimulator:
         self._vehicle = vehicle
         hovering = np.asarray(_hovering(vehicle))
         self._numbers = np.repeat(hovering[:, None], number, axis=1)
-        self._pending = np.zeros((vehicle.action_latency_steps, 4, number), np.float32)
+        self._hover = float(hover_action(vehicle))
+        self._pending = np.full((vehicle.action_latency_steps, 4, number), self._hover, np.float32)
 
     def place(self, states: VehicleStates, which: np.ndarray | None = None) -> None:
         chosen = slice(None) if which is None else which
         self._numbers, self._pending = np.array(self._numbers), np.array(self._pending)
         self._numbers[:, chosen] = states.rows().T
-        self._pending[..., chosen] = 0.0
+        self._pending[..., chosen] = self._hover
 
     def advance(self, action: np.ndarray) -> None:
         given = np.asarray(action, np.float32).T
@@ -61,8 +64,8 @@ def _hovering(vehicle: Vehicle) -> jax.Array:
 
 
 @lru_cache  # the same function for the same number, so that one compiled program serves every simulator
-def _physics(physics_steps: int) -> Physics:
-    return dynamics.step if physics_steps == PHYSICS_STEPS else partial(dynamics.step, physics_steps=physics_steps)
+def _physics(physics_steps: int | None) -> Physics:
+    return dynamics.step if physics_steps is None else partial(dynamics.step, physics_steps=physics_steps)
 
 
 @partial(jax.jit, static_argnums=0)

@@ -8,12 +8,13 @@ from annotated_types import Ge, Le, Unit
 from flytune.config.document import Whole
 from flytune.config.pytree import pytree, static
 from flytune.errors import require
-from flytune.physics.dynamics import CONTROL_PERIOD
-from flytune.physics.rotors import thrust
+from flytune.physics.dynamics import has_body_drag
+from flytune.physics.rotors import drag_torque, spins, thrust
 from flytune.physics.vehicle import Vehicle
 from flytune.simulation.actuator import Actuator
-from flytune.simulation.model_files import Integrator, mjcf
-from flytune.simulation.simulator import VehicleStates
+from flytune.simulation.aerodynamics import drag
+from flytune.simulation.model_files import Integrator, has_curves, mjcf, torque_ratio
+from flytune.simulation.simulator import VehicleStates, quaternion_product, to_inertial
 
 POSITION, ATTITUDE = slice(1, 4), slice(4, 8)  # in MuJoCo's state (time, qpos, qvel) of one free body
 VELOCITY, BODY_RATE = slice(8, 11), slice(11, 14)
@@ -45,7 +46,7 @@ class MujocoSimulator:
         """
         mujoco, self._rollout = require("mujoco", "mujoco"), require("mujoco.rollout", "mujoco")
         self._vehicle, self._options = vehicle, options
-        self._period = CONTROL_PERIOD / options.physics_steps
+        self._period = vehicle.control_period / options.physics_steps
         text = mjcf(vehicle, timestep=self._period, integrator=options.integrator)
         self._model = mujoco.MjModel.from_xml_string(text)
         self._model.dof_damping[:3] = vehicle.drag
@@ -65,10 +66,41 @@ class MujocoSimulator:
     def advance(self, action: np.ndarray) -> None:
         self._actuator.command(action)
         speeds = [self._actuator.turn(self._period) for _ in range(self._options.physics_steps)]
-        controls = thrust(self._vehicle, np.stack(speeds, axis=1) ** 2)
+        if has_body_drag(self._vehicle):  # which depends on the states between
+            for each in speeds:
+                forces = self._forces(each)
+                self._step(np.concatenate([forces, self._drag(each, forces)], axis=-1)[:, None])
+        else:
+            self._step(np.stack([self._forces(each) for each in speeds], axis=1))
+
+    def _step(self, controls: np.ndarray) -> None:
+        """Simulate as many physics steps as there are controls [N, steps, _]."""
         self._state[:, 0] = 0.0  # time, on which nothing depends
         states, _ = self._rollout.rollout(self._model, self._data, self._state, controls)
         self._state = np.array(states[:, -1])
+
+    def _forces(self, rotor_speed_rpm: np.ndarray) -> np.ndarray:
+        """The thrust of each rotor, and where the curves have linear parts the rest of the yaw torque."""
+        vehicle = self._vehicle
+        thrusts = thrust(vehicle, rotor_speed_rpm)
+        if not has_curves(vehicle):
+            return thrusts
+        rest = drag_torque(vehicle, rotor_speed_rpm) - torque_ratio(vehicle) * thrusts
+        return np.concatenate([thrusts, (rest @ np.array(spins(vehicle)))[:, None]], axis=-1)
+
+    def _drag(self, rotor_speed_rpm: np.ndarray, forces: np.ndarray) -> np.ndarray:
+        """The drag in the body frame, at the attitude and the velocity of the middle of the step, about."""
+        now, half = self.states(), self._period / 2
+        middle = now.attitude + half / 2 * quaternion_product(now.attitude, now.body_rate)
+        middle /= np.linalg.norm(middle, axis=-1, keepdims=True)
+        lift = np.zeros_like(now.velocity)
+        lift[:, 2] = forces[:, :4].sum(axis=-1) / self._vehicle.mass
+        slowing = drag(self._vehicle, now.attitude, now.velocity, rotor_speed_rpm) / self._vehicle.mass
+        pull = (
+            to_inertial(now.attitude, lift + slowing) - np.array(self._vehicle.drag) / self._vehicle.mass * now.velocity
+        )
+        pull[:, 2] -= self._vehicle.gravity
+        return drag(self._vehicle, middle, now.velocity + half * pull, rotor_speed_rpm)
 
     def states(self) -> VehicleStates:
         state = self._state

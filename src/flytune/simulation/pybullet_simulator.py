@@ -1,5 +1,6 @@
 """PyBullet as a simulator: the paper's simulator (paper R6), with a force at each motor."""
 
+import dataclasses
 import tempfile
 from typing import Annotated
 
@@ -9,15 +10,15 @@ from annotated_types import Ge, Le, Unit
 from flytune.config.document import Real, Whole
 from flytune.config.pytree import pytree, static
 from flytune.errors import BadInput, require
-from flytune.physics.dynamics import CONTROL_PERIOD
-from flytune.physics.rotors import places, spins, thrust
-from flytune.physics.vehicle import Vehicle
+from flytune.physics.dynamics import has_body_drag
+from flytune.physics.rotors import drag_torque, places, spins, thrust
+from flytune.physics.vehicle import Vehicle, inertia_matrix
 from flytune.simulation.actuator import Actuator
-from flytune.simulation.aerodynamics import ground_effect, rotor_drag
+from flytune.simulation.aerodynamics import drag, ground_effect
 from flytune.simulation.model_files import urdf
-from flytune.simulation.simulator import VehicleStates, to_body, to_inertial
+from flytune.simulation.simulator import VehicleStates, rotate_attitude, to_body, to_inertial
 
-NEEDED = {"ground_effect": "ground_effect = k", "rotor_drag": "rotor_drag = [x, y, z] in kg/rad; 0 for none"}
+NEEDED = {"ground_effect": "ground_effect = k", "rotor_drag": "optional_rotor_drag = [x, y, z] in kg/rad; 0 for none"}
 BODY = -1  # PyBullet's index of a vehicle's base link
 
 
@@ -29,7 +30,7 @@ class PyBulletOptions:
     # slows a free body by damping * (1 + |v|) * v, and its rotation alike; Bullet's own default is 0.04
     damping: Annotated[Real, Ge(0), Le(1), Unit("1/s")] = 0.0
     ground_effect: bool = static(default=False)  # propellers near a floor at z = 0 push harder
-    rotor_drag: bool = static(default=False)  # turning propellers are slowed by the air they move through
+    rotor_drag: bool = static(default=False)  # the vehicle's optional rotor drag acts
 
 
 class PyBulletSimulator:
@@ -48,7 +49,9 @@ class PyBulletSimulator:
         Raises:
             BadInput: PyBullet is not installed, too many of its clients are open, or the vehicle lacks a coefficient.
         """
-        for effect in ("ground_effect", "rotor_drag"):
+        if options.rotor_drag and vehicle.rotor_drag is None:
+            vehicle = dataclasses.replace(vehicle, rotor_drag=vehicle.optional_rotor_drag)
+        for effect in NEEDED:
             if getattr(options, effect) and getattr(vehicle, effect) is None:
                 raise BadInput(
                     f"world pybullet: {effect}=true is not possible, since the vehicle {vehicle.name} does not say its "
@@ -56,17 +59,20 @@ class PyBulletSimulator:
                 )
         self._bullet = require("pybullet", "pybullet")
         self._vehicle, self._options = vehicle, options
-        self._period = CONTROL_PERIOD / options.physics_steps
+        self._period = vehicle.control_period / options.physics_steps
         self._actuator = Actuator(vehicle, number)
-        self._motors, self._spins = [[x, y, 0.0] for x, y in places(vehicle).tolist()], np.array(spins(vehicle))
-        self._drag = np.array(vehicle.drag, float)
+        self._spins, self._drag = np.array(spins(vehicle)), np.array(vehicle.drag, float)
+        # Bullet's link has the principal axes of inertia; `to_link` takes vectors of the body there
+        moments, to_link = principal_axes(vehicle)
+        self._motors = [(to_link @ [x, y, 0.0]).tolist() for x, y in places(vehicle).tolist()]
+        self._up, self._to_link = to_link @ [0.0, 0.0, 1.0], to_link
         self._client = self._bullet.connect(self._bullet.DIRECT)
         if self._client < 0:
             raise BadInput("pybullet: no client is left. Close a simulator that is no longer needed.")
         self._bullet.setGravity(0, 0, -float(vehicle.gravity), physicsClientId=self._client)
         self._bullet.setTimeStep(self._period, physicsClientId=self._client)
         with tempfile.NamedTemporaryFile("w", suffix=".urdf", encoding="utf-8") as file:
-            file.write(urdf(vehicle))
+            file.write(urdf(dataclasses.replace(vehicle, inertia=moments, products_of_inertia=None)))
             file.flush()
             self._vehicles = [self._load(file.name) for _ in range(number)]
 
@@ -88,7 +94,8 @@ class PyBulletSimulator:
     def place(self, states: VehicleStates, which: np.ndarray | None = None) -> None:
         chosen = range(len(self._vehicles)) if which is None else which
         turning = to_inertial(np.asarray(states.attitude, float), np.asarray(states.body_rate, float))
-        parts = (part.tolist() for part in (states.position, states.attitude, states.velocity, turning))
+        attitude = rotate_attitude(np.asarray(states.attitude, float), self._to_link.T)
+        parts = (part.tolist() for part in (states.position, attitude, states.velocity, turning))
         for index, position, attitude, velocity, rate in zip(chosen, *parts, strict=True):
             vehicle = self._vehicles[int(index)]
             self._bullet.resetBasePositionAndOrientation(vehicle, position, attitude, physicsClientId=self._client)
@@ -104,23 +111,22 @@ class PyBulletSimulator:
     def _push(self, rotor_speed_rpm: np.ndarray) -> None:
         """Apply the forces of a physics step: a thrust at each motor, their torque about z, drag and ground effect."""
         bullet, client, frame = self._bullet, self._client, self._bullet.LINK_FRAME
-        squared = rotor_speed_rpm**2
-        forces = thrust(self._vehicle, squared)
-        if self._options.ground_effect or self._options.rotor_drag or self._drag.any():
+        forces = thrust(self._vehicle, rotor_speed_rpm)
+        if self._options.ground_effect or self._drag.any() or has_body_drag(self._vehicle):
             forces = self._resist(rotor_speed_rpm, forces)
-        twist = self._vehicle.torque_coefficient * squared @ self._spins
+        twist = drag_torque(self._vehicle, rotor_speed_rpm) @ self._spins
         for vehicle, pushes, torque in zip(self._vehicles, forces.tolist(), twist.tolist(), strict=True):
             for motor, force in zip(self._motors, pushes, strict=True):
-                bullet.applyExternalForce(vehicle, BODY, (0, 0, force), motor, frame, client)
-            bullet.applyExternalTorque(vehicle, BODY, (0, 0, torque), frame, client)
+                bullet.applyExternalForce(vehicle, BODY, (force * self._up).tolist(), motor, frame, client)
+            bullet.applyExternalTorque(vehicle, BODY, (torque * self._up).tolist(), frame, client)
 
     def _resist(self, rotor_speed_rpm: np.ndarray, forces: np.ndarray) -> np.ndarray:
         """The thrusts with ground effect; drag is applied on the way."""
         body = self.states()
-        drag = -self._drag * body.velocity
-        if self._options.rotor_drag:
-            drag += rotor_drag(self._vehicle, body.attitude, body.velocity, rotor_speed_rpm)
-        for vehicle, force, place in zip(self._vehicles, drag.tolist(), body.position.tolist(), strict=True):
+        pull = -self._drag * body.velocity
+        if has_body_drag(self._vehicle):
+            pull += to_inertial(body.attitude, drag(self._vehicle, body.attitude, body.velocity, rotor_speed_rpm))
+        for vehicle, force, place in zip(self._vehicles, pull.tolist(), body.position.tolist(), strict=True):
             self._bullet.applyExternalForce(vehicle, BODY, force, place, self._bullet.WORLD_FRAME, self._client)
         if not self._options.ground_effect:
             return forces
@@ -130,7 +136,7 @@ class PyBulletSimulator:
         bullet, client = self._bullet, self._client
         places = [bullet.getBasePositionAndOrientation(vehicle, client) for vehicle in self._vehicles]
         motions = np.array([bullet.getBaseVelocity(vehicle, client) for vehicle in self._vehicles])
-        attitude = np.array([attitude for _, attitude in places])
+        attitude = rotate_attitude(np.array([attitude for _, attitude in places]), self._to_link)
         return VehicleStates(
             position=np.array([position for position, _ in places]),
             attitude=attitude,
@@ -144,3 +150,16 @@ class PyBulletSimulator:
         if self._client >= 0:
             self._bullet.disconnect(physicsClientId=self._client)
             self._client = -1
+
+
+def principal_axes(vehicle: Vehicle) -> tuple[tuple[float, float, float], np.ndarray]:
+    """The principal moments of inertia in kg m^2, and the matrix that takes vectors of the body to their axes.
+
+    Without products of inertia these are the body's own axes.
+    """
+    if vehicle.products_of_inertia is None:
+        return vehicle.inertia, np.eye(3)
+    moments, axes = np.linalg.eigh(inertia_matrix(vehicle))
+    axes[:, 2] *= np.sign(np.linalg.det(axes))
+    x, y, z = moments.tolist()
+    return (x, y, z), axes.T

@@ -56,7 +56,7 @@ class Simulator(Protocol):
         ...
 
     def advance(self, action: Float[np.ndarray, "N 4"]) -> None:
-        """Simulate one control period (0.01 s) under actions [N, 4], clipped to [-1, 1]."""
+        """Simulate one control period of the vehicle under actions [N, 4], clipped to [-1, 1]."""
         ...
 
     def states(self) -> VehicleStates:
@@ -91,6 +91,24 @@ def rotation_matrix(attitude: Float[np.ndarray, "N 4"]) -> Float[np.ndarray, "N 
         [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
     ]
     return np.moveaxis(np.array(rows), -1, 0)
+
+
+def quaternion_product(
+    attitude: Float[np.ndarray, "N 4"], vector: Float[np.ndarray, "N 3"]
+) -> Float[np.ndarray, "N 4"]:
+    """Quaternions (x, y, z, w) times vectors as quaternions without a real part: q (v, 0)."""
+    axis, real = attitude[:, :3], attitude[:, 3:]
+    turned = np.cross(axis, vector) + real * vector
+    return np.concatenate([turned, -np.sum(axis * vector, axis=-1, keepdims=True)], axis=-1)
+
+
+def rotate_attitude(attitude: Float[np.ndarray, "N 4"], matrix: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "N 4"]:
+    """The attitudes (x, y, z, w) after a further turn in the body's own frame, given as a rotation matrix."""
+    if np.array_equal(matrix, np.eye(3)):
+        return attitude
+    from scipy.spatial.transform import Rotation  # late, because it is slow to import
+
+    return (Rotation.from_quat(attitude) * Rotation.from_matrix(matrix)).as_quat()
 
 
 def to_inertial(attitude: Float[np.ndarray, "N 4"], vector: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, "N 3"]:

@@ -1,23 +1,27 @@
 """Whether starts, target and terminations agree: a task is refused whose episodes all end as soon as they begin."""
 
+import dataclasses
 import math
-from collections.abc import Mapping
 from typing import Any
 
+import jax
+import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
 
 from flytune.config import document
 from flytune.errors import BadInput
-from flytune.physics.dynamics import CONTROL_PERIOD
+from flytune.kernels.programs import program
+from flytune.physics import rotation
+from flytune.physics.components import Components
+from flytune.physics.vehicle import Vehicle
 from flytune.task.following import settings_to_check, words
 from flytune.task.initial_state import InitialState
+from flytune.task.situation import situation
 from flytune.task.task import Task
-from flytune.task.termination import Bounded
 
 FEWEST = 0.05  # share of the starts that have to survive; of fewer nothing is learned
 STARTS = 2000  # that are drawn to measure it
-WORDS = {  # quantity -> what starts are like, and the factor of their numbers from SI units
+WORDS = {  # quantity that starts decide -> what they are like, and the factor of their numbers from SI units
     "altitude": ("are {low:.3g} to {high:.3g} m high", 1.0),
     "distance": ("lie {low:.3g} to {high:.3g} m from the target", 1.0),
     "attitude_error": ("are turned by {low:.3g} to {high:.3g} rad from the target", 1.0),
@@ -64,48 +68,43 @@ def disagreement(task: Task, initial_state: InitialState, where: str, slack: flo
                 f"termination.{name}.bound: {end.limit:g} m is not below the target, which is {height:g} m high, so "
                 f"that an episode ends before it arrives. Give a bound below {height:g} m, or a higher target.position."
             )
-    starts = _quantities(task, initial_state)
-    alive = {name: _kept(end, starts, slack) for name, end in task.termination.items() if end.quantity in starts}
+    rate = task.limit("body_rate")
+    measures, inside = _starts(task, initial_state, np.float32(slack), np.float32(math.inf if rate is None else rate))
+    checked = [name for name, end in task.termination.items() if end.quantity in WORDS]
+    alive = {name: np.asarray(inside[name]) for name in checked}
     if not alive or np.mean(np.logical_and.reduce(list(alive.values()))) >= FEWEST:
         return None
     worst = min(alive, key=lambda name: np.mean(alive[name]))
-    return _message(worst, task.termination[worst], starts, where, float(np.mean(alive[worst])))
+    return _message(worst, task.termination[worst], measures[worst], where, float(np.mean(alive[worst])))
 
 
-def _kept(end: Bounded, starts: Mapping[str, np.ndarray], slack: float) -> np.ndarray:
-    """Which starts lie within a bound."""
-    limit, values = float(end.limit), starts[end.quantity]
-    if end.quantity == "altitude":
-        return values >= limit - slack * (limit if limit > 0 else 1.0)  # the unit of its margin
-    return values <= limit * (1 + slack)
+@program()
+def _starts(task: Task, initial_state: InitialState, slack: Any, rate_limit: Any) -> tuple[dict[str, Any], ...]:
+    """What each termination bounds [N], and whether it goes on [N], at many starts.
+
+    Args:
+        task: a task without dials.
+        initial_state: where its episodes begin.
+        slack: share of a bound by which it may be passed before an episode ends.
+        rate_limit: on the body rate in rad/s, infinite where there is none.
+    """
+
+    def one(key: jax.Array) -> tuple[dict[str, Any], ...]:
+        state = initial_state.draw(task.vehicle, task.target, key)
+        gained = _speed_gained(task.vehicle, state.attitude, rate_limit)
+        state = dataclasses.replace(state, velocity=(gained, jnp.zeros(()), jnp.zeros(())))
+        here = situation(task.reference(0), state, jnp.zeros(4))
+        ends = task.termination.items()
+        return (
+            {name: end.measure(here) for name, end in ends},
+            {name: end.margin(here) + slack * end.slack >= 0 for name, end in ends},
+        )
+
+    return jax.vmap(one)(jax.random.split(jax.random.key(0), STARTS))
 
 
-def _quantities(task: Task, initial_state: InitialState) -> dict[str, Float[np.ndarray, "N"]]:
-    """What the terminations bound, at many starts, in SI units."""
-    share = np.random.default_rng(0).random((6, STARTS))
-    offset = np.array([float(each) for each in initial_state.moved(task.target)])
-    low, high = (
-        np.array(each, float) + offset for each in (initial_state.lowest_position, initial_state.highest_position)
-    )
-    low[2] = max(low[2], initial_state.lowest_altitude)
-    position = low + (high - low) * share[:3].T
-    roll, pitch = float(initial_state.largest_tilt) * (2 * share[3:5] - 1)
-    yaw = float(initial_state.largest_yaw) * (2 * share[5] - 1)
-    real = np.prod([np.cos(each / 2) for each in (roll, pitch, yaw)], axis=0)
-    real += np.prod([np.sin(each / 2) for each in (roll, pitch, yaw)], axis=0)
-    level = np.cos(roll) * np.cos(pitch)  # the z component of the body's z axis
-    tilts = np.arctan2(np.cos(pitch) * np.sin(roll), level), np.arcsin(np.sin(pitch))
-    return {
-        "altitude": position[:, 2],
-        "distance": np.linalg.norm(position - np.array(task.target.position, float), axis=-1),
-        "attitude_error": 2 * np.arccos(np.minimum(np.abs(real), 1.0)),
-        "tilt": np.abs(tilts).max(axis=0),
-        "speed": _speed_gained(task, np.arccos(np.clip(level, -1, 1))),
-    }
-
-
-def _speed_gained(task: Task, tilt: Float[np.ndarray, "N"]) -> Float[np.ndarray, "N"]:
-    """The horizontal speed in m/s that a start at rest gains before it is level, from its tilt in rad.
+def _speed_gained(vehicle: Vehicle, attitude: Components, rate_limit: Any) -> Any:
+    """The horizontal speed in m/s that a start at rest gains before it is level.
 
         v = g sin(tilt) t0 + g sin(tilt)^2 / (2 w)
 
@@ -113,16 +112,14 @@ def _speed_gained(task: Task, tilt: Float[np.ndarray, "N"]) -> Float[np.ndarray,
     its body rate w, with a thrust that just leaves no acceleration along itself, g cos(tilt). A larger tilt than a
     right angle counts as one.
     """
-    steep = np.sin(np.minimum(tilt, math.pi / 2))
-    rate, gravity = task.limit("body_rate"), float(task.vehicle.gravity)
-    waits = (1 + task.vehicle.action_latency_steps) * CONTROL_PERIOD
-    return gravity * steep * waits + (0.0 if rate is None else gravity * steep**2 / (2 * rate))
+    steep = jnp.sin(jnp.minimum(jnp.arccos(jnp.clip(rotation.vertical_axis(attitude)[2], -1, 1)), math.pi / 2))
+    waits = (1 + vehicle.action_latency_steps) * vehicle.control_period
+    return vehicle.gravity * (steep * waits + steep**2 / (2 * rate_limit))
 
 
-def _message(name: str, end: Any, starts: Mapping[str, np.ndarray], where: str, kept: float) -> str:
-    values = starts[end.quantity]
+def _message(name: str, end: Any, measures: Any, where: str, kept: float) -> str:
     text, factor = WORDS[end.quantity]
-    low, high = factor * float(values.min()), factor * float(values.max())
+    low, high = factor * float(np.min(measures)), factor * float(np.max(measures))
     remedy = f"of at most {low:.3g}" if end.quantity == "altitude" else f"of at least {high:.3g}"
     share = "every episode" if kept == 0 else f"{1 - kept:.3g} of all episodes"
     unit = document.unit_of(type(end), {}, end.key)

@@ -139,7 +139,8 @@ def checked_setting(dials: Mapping[str, Dial], setting: Setting, where: str = "d
     for name, value in setting.items():
         if name not in dials:
             allowed = f"Allowed: {', '.join(dials)}" if dials else "This one has no dial"
-            raise BadInput(f"{where}: {name!r} is no dial here. {allowed}.")
+            hint = document.nearest(name, dials)
+            raise BadInput(f"{where}: {name!r} is no dial here. {allowed}.{f' Did you mean {hint}?' if hint else ''}")
         dial, number = dials[name], as_number(value)
         room = TOLERANCE * abs(dial.highest - dial.lowest)
         if number is None or not dial.lowest - room <= number <= dial.highest + room:

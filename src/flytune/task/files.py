@@ -2,16 +2,18 @@
 
 import dataclasses
 import os
+from collections.abc import Mapping
 from importlib import resources
 from pathlib import Path
 from typing import Any, TypeGuard
 
 from flytune.config import document, nested
-from flytune.config.fields import annotations
-from flytune.config.removal import NONE, is_named, without_none
+from flytune.config.fields import annotations, is_named
+from flytune.config.recognise import TASK, VEHICLE, meant, misplaced, runs_in
+from flytune.config.removal import NONE, without_none
 from flytune.errors import BadInput
 from flytune.physics.plausibility import summary
-from flytune.physics.vehicle import Vehicle, vehicle_table
+from flytune.physics.vehicle import Vehicle, vehicle_names, vehicle_table
 from flytune.task.following import check_given, settings_to_check
 from flytune.task.target import of_kind
 from flytune.task.task import Task
@@ -57,22 +59,35 @@ def load_task(task: str | Path, edits: dict[str, Any] | None = None) -> Task:
     name, given = str(task), {}
     if name not in preset_names() and os.path.isfile(os.path.join(name, TASK_FILE)):
         name = os.path.join(name, TASK_FILE)
+    elif line := misplaced(name, TASK):
+        raise BadInput(f"task: {line}")
     if name in preset_names():
         data, where = _preset(name), ""
+    elif name.endswith(".toml") and not os.path.exists(name) and (hint := meant(name, TASK, [], [".toml"])):
+        raise BadInput(f"task: {name}: no such file.{hint}")
     elif name.endswith(".toml") or os.path.isfile(name):
         data, given = _from_file(Path(name))
         where = name
     else:
-        hint = document.nearest(name, preset_names())
+        hint = meant(name, TASK, preset_names(), [".toml"]) or runs_in(name)
         raise BadInput(
             f"task: {name!r} is no preset. Allowed: {', '.join(preset_names())}, a .toml file, or a run directory."
-            + (f" Did you mean {hint}?" if hint else "")
+            f"{hint}"
         )
     task_read = _read(data, where)
     check_given(task_read.follow, document.plain(task_read), given, where)
     if not edits:
         return task_read
-    complete = document.plain(task_read)
+    return edited_task(task_read, edits)
+
+
+def edited_task(task: Task, edits: Mapping[str, Any]) -> Task:
+    """A task with edits applied, as in `load_task`.
+
+    Raises:
+        BadInput: a field or a value that is not allowed.
+    """
+    complete = document.plain(task)
     for path, value in sorted(edits.items(), key=lambda edit: edit[0].count(".")):  # a table before what is in it
         complete = _edited(complete, path, value)
     return _read(complete)
@@ -103,7 +118,7 @@ def _from_file(path: Path, above: tuple[Path, ...] = ()) -> tuple[dict[str, Any]
     data = _with_sources({"name": path.stem, **given}, str(path))
     named = isinstance(vehicle := data.get("vehicle"), str)
     if isinstance(vehicle, str):
-        data["vehicle"] = vehicle_table(vehicle, path.parent, f"{path}: ")
+        data["vehicle"] = _vehicle(vehicle, path.parent, f"{path}: ")
     if _is_csv(target := data.get("target")):
         data["target"] = read_target(target, path.parent, f"{path}: ")
     if "based_on" not in data:
@@ -112,6 +127,8 @@ def _from_file(path: Path, above: tuple[Path, ...] = ()) -> tuple[dict[str, Any]
     if base in preset_names():
         below, said = _preset(base), {}
     elif isinstance(base, str) and base.endswith(".toml"):
+        if line := misplaced(str(path.parent / base), TASK):
+            raise BadInput(f"{path}: based_on: {line}")
         below, said = _from_file(path.parent / base, (*above, resolved))
     else:
         hint = document.nearest(str(base), preset_names())
@@ -145,6 +162,8 @@ def _laid_over(
                 _check_there(below, (name, key), f"{where}: ")
         if changes.get(name) == {}:
             below = {**below, name: {}}
+    for path, value in nested.leaves(changes, skip=("vehicle", "follow", *nested.LABELS)):
+        _check_table(below, path, value, f"{where}: ")
     if isinstance(vehicle := changes.get("vehicle"), dict) and "vehicle" in below and not whole_vehicle:
         changes["vehicle"] = _vehicle_over(below["vehicle"], vehicle)
     if "kind" in _table(changes, "target") and changes["target"]["kind"] != _table(below, "target").get(
@@ -156,12 +175,26 @@ def _laid_over(
     return nested.overlay(below, changes)
 
 
+def _vehicle(name: str, folder: Path = Path(), where: str = "") -> dict[str, Any]:
+    """The tables of a vehicle, see `vehicle_table`; what is something else is refused with its use."""
+    if name not in vehicle_names() and (line := misplaced(str(folder / Path(name).expanduser()), VEHICLE)):
+        raise BadInput(f"{where}vehicle: {line}")
+    if (
+        name.endswith(".toml")
+        and not where
+        and not os.path.exists(name)
+        and (hint := meant(name, VEHICLE, [], [".toml"]))
+    ):
+        raise BadInput(f"vehicle: {name}: no such file.{hint}")
+    return vehicle_table(name, folder, where)
+
+
 def _vehicle_over(below: str | dict[str, Any], vehicle: dict[str, Any]) -> dict[str, Any]:
     """A vehicle's table laid over that of the base; one that is complete replaces it."""
     required = {field.name for field in dataclasses.fields(Vehicle) if field.default is field.default_factory}
     if required <= vehicle.keys():
         return vehicle
-    base = dict(vehicle_table(below) if isinstance(below, str) else below)
+    base = dict(_vehicle(below) if isinstance(below, str) else below)
     for one, other in (("arm", "rotors"), ("rotors", "arm")):
         if one in vehicle and other not in vehicle:
             base.pop(other, None)
@@ -182,6 +215,21 @@ def _check_there(tables: dict[str, Any], path: tuple[str, str], prefix: str = ""
             f"{prefix}{table}.{name}: there is none that could be removed. There are: {', '.join(there) or 'none'}."
             + (f" Did you mean {table}.{hint}?" if hint else "")
         )
+
+
+def _check_table(tables: dict[str, Any], path: str, value: Any, prefix: str = "") -> None:
+    """Refuse a value in place of a table.
+
+    Raises:
+        BadInput: it is one; the line names what is in the table.
+    """
+    there = nested.look_up(tables, path)
+    if path in nested.LABELS or not isinstance(there, dict) or isinstance(value, dict) or value == NONE:
+        return
+    remove = ' "none" removes it.' if path.partition(".")[0] in NAMED else ""
+    what = f"Give one of {', '.join(vehicle_names())}, a .toml file, or edit" if path == "vehicle" else "Edit"
+    fields = ", ".join(f"{path}.{each}" for each in there if each not in nested.LABELS)
+    raise BadInput(f"{prefix}{path}: {value!r} is not allowed for a table. {what} what is in it: {fields}.{remove}")
 
 
 def _with_sources(data: dict[str, Any], file: str) -> dict[str, Any]:
@@ -236,7 +284,7 @@ def _read(data: dict[str, Any], where: str = "") -> Task:
     if _is_csv(target):
         data = {**data, "target": read_target(target, Path(), f"{where}: " if where else "")}
     vehicle = data.get("vehicle")
-    complete = {**data, "vehicle": vehicle_table(vehicle)} if isinstance(vehicle, str) else data
+    complete = {**data, "vehicle": _vehicle(vehicle)} if isinstance(vehicle, str) else data
     return _at_default(document.read(Task, _without_removed(complete), where), where)
 
 
@@ -282,10 +330,11 @@ def _edited(data: dict[str, Any], path: str, value: Any) -> dict[str, Any]:
         formula = str(value) if isinstance(value, int | float) and not isinstance(value, bool) else value
         return {**data, "follow": {**data.get("follow", {}), path.removeprefix("follow."): formula}}
     if path == "vehicle" and isinstance(value, str):
-        return {**data, "vehicle": vehicle_table(value)}
+        return {**data, "vehicle": _vehicle(value)}
     table, _, name = path.partition(".")
     if value == NONE and table in NAMED and name and "." not in name:
         _check_there(data, (table, name))
+    _check_table(data, path, value)
     if path == "target.kind" and isinstance(value, str) and isinstance(data["target"], dict):
         sources = _without_target(data.get("sources", {}))
         data = {**data, "target": of_kind(data["target"], value), "sources": sources}

@@ -26,6 +26,7 @@ from flytune.task.situation import (
 SIZE = 17
 BLOCK_NAMES = ("position_error", "attitude_error", "velocity", "body_rate", "last_action")
 BLOCKS = (3, 4, 3, 3, 4)  # numbers in each
+RATE = 100  # Hz, at which the noise is given (paper R6)
 NOISY = 13  # the first 13 carry noise; the last action does not
 LAYOUT = (
     "position_error (3) [m, heading frame], attitude_error (4) [x y z w], velocity (3) [m/s, heading frame], "
@@ -48,6 +49,12 @@ class ObservationNoise:
     ]
     velocity: Annotated[Real, Ge(0), Le(100), Unit("m/s")]
     body_rate: Annotated[Real, Ge(0), Le(100), Unit("rad/s")]
+
+    def at_rate(self, rate: int) -> "ObservationNoise":
+        """The noise at a control rate in Hz: that of sensors with the same noise density as these have at 100 Hz."""
+        if rate == RATE:
+            return self
+        return jax.tree.map(lambda deviation: deviation * (rate / RATE) ** 0.5, self)
 
 
 def observe(

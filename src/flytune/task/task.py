@@ -76,7 +76,7 @@ class Task:
         """Where the target is after some control steps, and how it moves; a fixed one is the same at any time."""
         if isinstance(self.target, Point):
             return self.target.reference()
-        return self.target.reference(jnp.maximum(steps, 0) * CONTROL_PERIOD, self.vehicle.gravity)
+        return self.target.reference(jnp.maximum(steps, 0) * self.vehicle.control_period, self.vehicle.gravity)
 
     def draw(self, key: jax.Array) -> tuple[Any, jax.Array]:
         """The settings of the dials of one episode; without a dial nothing, and the key itself. See `TaskFamily`."""
@@ -140,7 +140,7 @@ class Task:
     def problem_of_path(self, duration: float) -> str | None:
         """What of the target's path cannot be flown for a duration in s within the bounds, or None."""
         vehicle = self.vehicle
-        return problem_of_path(self.target, self.termination, vehicle.gravity, vehicle.thrust_to_weight, duration)
+        return problem_of_path(self.target, self.termination, vehicle.gravity, vehicle.full_thrust_to_weight, duration)
 
 
 @runtime_checkable

@@ -3,7 +3,7 @@
 A condition returns a margin, the share of its bound that is left: positive inside, zero at the bound, negative beyond.
 Training, barriers, evaluation and plots all read the same margins.
 
-To add a condition: write a subclass of `Bounded` with a `kind`, a bound and `margin(situation)`, and name it in
+To add a condition: write a subclass of `Bounded` with a `kind`, a bound and `measure(situation)`, and name it in
 `Termination`.
 """
 
@@ -41,6 +41,14 @@ class Bounded:
         """The bound in SI units: m, m/s, rad or rad/s."""
         return getattr(self, self.key)
 
+    def measure(self, situation: Situation) -> Float[Array, ""]:
+        """What is bounded, in the unit of the limit."""
+        raise NotImplementedError
+
+    def margin(self, situation: Situation) -> Float[Array, ""]:
+        """Share of the bound that is left: 1 - measure / limit."""
+        return 1 - self.measure(situation) / self.limit
+
 
 @pytree
 class MinimumAltitude(Bounded):
@@ -49,6 +57,10 @@ class MinimumAltitude(Bounded):
     quantity = "altitude"
     kind: Literal["minimum_altitude"] = static(default="minimum_altitude")
     bound: Annotated[Real, Ge(-1000), Le(1000), Unit("m")]
+
+    def measure(self, situation: Situation) -> Float[Array, ""]:
+        """The altitude."""
+        return situation.altitude
 
     def margin(self, situation: Situation) -> Float[Array, ""]:
         """(z - bound) / bound: zero at the bound, one at twice its height; of a bound of 0 or below, z - bound in m."""
@@ -66,9 +78,9 @@ class MaximumDistance(Bounded):
     kind: Literal["maximum_distance"] = static(default="maximum_distance")
     bound: Annotated[Real, Gt(0), Unit("m")]
 
-    def margin(self, situation: Situation) -> Float[Array, ""]:
-        """Share of the bound that is left: 1 at the target."""
-        return 1 - rotation.safe_norm(situation.position_error) / self.limit
+    def measure(self, situation: Situation) -> Float[Array, ""]:
+        """The distance to the target."""
+        return rotation.safe_norm(situation.position_error)
 
 
 @pytree
@@ -82,9 +94,9 @@ class MaximumAttitudeError(Bounded):
     kind: Literal["maximum_attitude_error"] = static(default="maximum_attitude_error")
     bound: Annotated[Real, Gt(0), Le(math.pi), Unit("rad")]
 
-    def margin(self, situation: Situation) -> Float[Array, ""]:
-        """Share of the bound that is left: 1 at the target's attitude."""
-        return 1 - rotation.angle(situation.attitude_error) / self.limit
+    def measure(self, situation: Situation) -> Float[Array, ""]:
+        """The angle to the target's attitude."""
+        return rotation.angle(situation.attitude_error)
 
 
 @pytree
@@ -100,9 +112,9 @@ class MaximumTilt(Bounded):
         """The bound in rad."""
         return self.bound_deg * math.pi / 180
 
-    def margin(self, situation: Situation) -> Float[Array, ""]:
-        """Share of the bound that the larger of |roll| and |pitch| leaves."""
-        return 1 - jnp.maximum(jnp.abs(situation.roll), jnp.abs(situation.pitch)) / self.limit
+    def measure(self, situation: Situation) -> Float[Array, ""]:
+        """The larger of |roll| and |pitch|."""
+        return jnp.maximum(jnp.abs(situation.roll), jnp.abs(situation.pitch))
 
 
 @pytree
@@ -116,9 +128,9 @@ class MaximumSpeed(Bounded):
     kind: Literal["maximum_speed"] = static(default="maximum_speed")
     bound: Annotated[Real, Gt(0), Unit("m/s")]
 
-    def margin(self, situation: Situation) -> Float[Array, ""]:
-        """Share of the bound that is left: 1 at rest."""
-        return 1 - rotation.safe_norm(situation.velocity) / self.limit
+    def measure(self, situation: Situation) -> Float[Array, ""]:
+        """The speed."""
+        return rotation.safe_norm(situation.velocity)
 
 
 @pytree
@@ -137,9 +149,9 @@ class MaximumBodyRate(Bounded):
         """The bound in rad/s."""
         return self.bound_deg_per_s * math.pi / 180
 
-    def margin(self, situation: Situation) -> Float[Array, ""]:
-        """Share of the bound that is left: 1 where nothing turns."""
-        return 1 - rotation.safe_norm(situation.body_rate) / self.limit
+    def measure(self, situation: Situation) -> Float[Array, ""]:
+        """The norm of the body rate."""
+        return rotation.safe_norm(situation.body_rate)
 
 
 Termination = Annotated[

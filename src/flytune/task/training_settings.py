@@ -9,6 +9,7 @@ from annotated_types import Ge, Gt, Le, Lt, Unit, doc
 from flytune.config.document import Real, Whole
 from flytune.config.pytree import pytree
 from flytune.task.initial_state import InitialState
+from flytune.task.observation import RATE
 
 Share = Annotated[Real, Ge(0), Le(1), Unit("1")]
 Positive = Annotated[Real, Gt(0), Unit("1")]
@@ -40,6 +41,10 @@ class TrainerSettings(Protocol):
         """The settings of a training of `steps` environment steps, rounded up to whole updates."""
         ...
 
+    def at_rate(self, rate: int) -> "TrainerSettings":
+        """The settings at a control rate in Hz: what is given for steps of 0.01 s, for control steps."""
+        ...
+
     def tuned(self, *, slow: bool, warm_start: bool) -> dict[str, tuple[Any, str]]:
         """The settings that a tuning changes by itself: name -> value and reason.
 
@@ -61,19 +66,25 @@ def _problem_of_samples(name: str, environments: int, steps: int, fewest: int = 
     )
 
 
+def _divisor(number: int, near: float) -> int:
+    """The divisor of a number that is nearest to a value, 2 or more."""
+    divisors = (each for each in range(2, number + 1) if number % each == 0)
+    return min(divisors, key=lambda each: abs(math.log(each / near)))
+
+
 @pytree
 class PpoSettings:
     """Proximal policy optimisation (Schulman et al. 2017), by default the paper's (R16 to R18)."""
 
-    steps: Annotated[Whole, Ge(1), Unit("environment steps")] = 6_000_000  # R18
+    steps: Annotated[Whole, Ge(1), Unit("environment steps of 0.01 s")] = 6_000_000  # R18
     environments: Count = 128  # reading of R18: 128 x 128 gives the samples of 4 x 4096
-    rollout: Annotated[Whole, Ge(1), Le(1_000_000), Unit("steps per environment")] = 128
+    rollout: Annotated[Whole, Ge(1), Le(1_000_000), Unit("steps of 0.01 s per environment")] = 128
     epochs: Count = 12  # R17
     minibatch: Annotated[Whole, Ge(2), Unit("samples"), doc("advantages are normalised in each")] = 128  # R17
     learning_rate: Annotated[Real, Gt(0), Unit("1")] = 2e-4  # R17
     clip_range: Annotated[Real, Gt(0), Unit("1")] = 0.15  # R17
-    discount: Annotated[Real, Ge(0), Le(1), Unit("1")] = 0.99  # R17: Stable-Baselines3
-    gae_lambda: Share = 0.95
+    discount: Annotated[Real, Ge(0), Le(1), Unit("per 0.01 s")] = 0.99  # R17: Stable-Baselines3
+    gae_lambda: Annotated[Real, Ge(0), Le(1), Unit("per 0.01 s")] = 0.95
     value_weight: Annotated[Real, Ge(0), Unit("1")] = 0.5
     entropy_weight: Annotated[Real, Ge(0), Unit("1")] = 0.0
     max_grad_norm: Annotated[Real, Gt(0), Unit("1")] = 0.5
@@ -109,6 +120,20 @@ class PpoSettings:
         """The settings of a training of `steps` environment steps, rounded up to whole updates."""
         return dataclasses.replace(self, steps=steps)
 
+    def at_rate(self, rate: int) -> "PpoSettings":
+        """The settings at a control rate in Hz, with as many minibatches as at 100 Hz and the same time constants."""
+        if rate == RATE:
+            return self
+        factor = rate / RATE
+        return dataclasses.replace(
+            self,
+            steps=math.ceil(self.steps * factor),
+            rollout=(rollout := math.ceil(self.rollout * factor)),
+            minibatch=_divisor(rollout * self.environments, self.minibatch * factor),
+            discount=self.discount ** (1 / factor),
+            gae_lambda=self.gae_lambda ** (1 / factor),
+        )
+
     def tuned(self, *, slow: bool, warm_start: bool) -> dict[str, tuple[Any, str]]:
         """The settings that a tuning changes by itself: none."""
         return {}
@@ -130,7 +155,7 @@ class ApgSettings:
     )
     updates: Count = 200
     environments: Count = 64
-    window: Annotated[Whole, Ge(1), Le(1_000_000), Unit("steps")] = 250  # of each episode in one gradient
+    window: Annotated[Whole, Ge(1), Le(1_000_000), Unit("steps of 0.01 s")] = 250  # of each episode in one gradient
     learning_rate: Annotated[Real, Gt(0), Unit("1")] = 5e-3  # of the biases, by Adam
     muon_factor: Annotated[Real, Ge(0), Unit("1")] = 16.0  # by Muon, the weights learn at this multiple; 0: by Adam too
     final_learning_rate: Share = 0.02  # as a share of the first, reached by a cosine
@@ -157,6 +182,10 @@ class ApgSettings:
     def with_steps(self, steps: int) -> "ApgSettings":
         """The settings of a training of `steps` environment steps, rounded up to whole updates."""
         return dataclasses.replace(self, updates=math.ceil(steps / self.steps_per_update))
+
+    def at_rate(self, rate: int) -> "ApgSettings":
+        """The settings at a control rate in Hz, with windows of the same time."""
+        return self if rate == RATE else dataclasses.replace(self, window=math.ceil(self.window * rate / RATE))
 
     def tuned(self, *, slow: bool, warm_start: bool) -> dict[str, tuple[Any, str]]:
         """The settings that a tuning changes by itself, see `TrainerSettings`."""

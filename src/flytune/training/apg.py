@@ -17,12 +17,13 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
 from flytune.config.pytree import pytree
-from flytune.control.policy import Network, Policy, make_network
+from flytune.control.policy import Network, Policy, make_network, with_output
 from flytune.kernels.dense import Actor
 from flytune.kernels.programs import program
+from flytune.physics.rotors import hover_action
 from flytune.simulation.environment import Episode, Outcome
 from flytune.simulation.rollout import Draw, reset_all, rollout, split_keys
-from flytune.task.observation import input_scale
+from flytune.task.observation import RATE, input_scale
 from flytune.task.task import Task
 from flytune.task.training_settings import ApgSettings
 from flytune.training.threads import PARTS, in_threads
@@ -83,6 +84,8 @@ def start(task: Task, settings: ApgSettings, key: Array) -> TrainState:
     task = dataclasses.replace(task, initial_state=settings.initial_state)
     actor_key, episode_key, key = jax.random.split(key, 3)
     actor = make_network(actor_key, (task.inputs, *settings.hidden, 4), last_gain=0.01)
+    if task.vehicle.action_scale is None:  # then the action 0 does not hover
+        actor = with_output(actor, jnp.arctanh(hover_action(task.vehicle)))
     keys = jax.random.split(episode_key, settings.environments)
     episodes = reset_all(task, keys)
     return TrainState(
@@ -182,6 +185,8 @@ def _loss(task: Task, settings: ApgSettings, actor: Network, episodes: Episode, 
     def record(task: Task, after: Episode, moved: Episode, outcome: Outcome) -> Any:
         costs = (task.termination[name].barrier * barrier(each, settings) for name, each in outcome.margins.items())
         cost = sum(costs, start=jnp.zeros(()))
+        if task.vehicle.control_rate != RATE:  # like the reward
+            cost = cost * (RATE / task.vehicle.control_rate)
         return outcome.reward - cost, *jax.lax.stop_gradient((outcome, moved))
 
     (episodes, _), step = rollout(task, decide, (episodes, ()), draws, record=record, slack=settings.termination_slack)

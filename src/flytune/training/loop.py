@@ -14,7 +14,7 @@ from typing import Any
 import jax
 
 from flytune.config.files import held, make_folder
-from flytune.control.policy import Policy
+from flytune.control.policy import Policy, facts_of_vehicle
 from flytune.errors import BadInput, Interrupted, require
 from flytune.runs.directory import RunDirectory, resume_command
 from flytune.task.files import write_task
@@ -101,7 +101,7 @@ def train(
             train_state = method.warm_start(task, train_state, start.policy, start.critic)
         if directory is not None and resume:
             train_state, rows = directory.resume(train_state)
-        settings = method.settings(task)
+        settings = method.settings_at_rate(task)
         clock = Clock(f"{task.name}  {trainer}  seed {seed}", settings, rows)
         saved = time.monotonic()
         with EventLog(out, rows) if tensorboard and out is not None else contextlib.nullcontext() as log:
@@ -125,7 +125,7 @@ def train(
 
     about = {  # the facts in the header of a policy file
         "task": task.name,
-        "vehicle": task.vehicle.name,
+        **facts_of_vehicle(task.vehicle),
         "task_toml": write_task(task),
         "trainer": trainer,
         "seed": seed,

@@ -18,10 +18,11 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, UInt32
 
 from flytune.config.pytree import pytree
-from flytune.control.policy import Network, Policy, make_network
+from flytune.control.policy import Network, Policy, make_network, with_output
 from flytune.kernels.batched import available
 from flytune.kernels.dense import perceptron
 from flytune.kernels.programs import program
+from flytune.physics.rotors import hover_action
 from flytune.simulation.environment import Episode, Outcome
 from flytune.simulation.rollout import Draw, reset_all
 from flytune.simulation.rollout import rollout as simulate
@@ -95,6 +96,9 @@ def start(task: Task, settings: PpoSettings, key: Array) -> TrainState:
         critic=make_network(critic_key, (task.inputs, *settings.hidden, 1), last_gain=1.0),
         log_std=jnp.full(4, settings.initial_log_std, float),
     )
+    if task.vehicle.action_scale is None:  # then the action 0 does not hover
+        actor = with_output(parameters.actor, hover_action(task.vehicle))
+        parameters = dataclasses.replace(parameters, actor=actor)
     keys = jax.random.split(episode_key, settings.environments)
     return TrainState(
         parameters=parameters,

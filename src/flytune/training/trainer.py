@@ -50,6 +50,10 @@ class Trainer:
         """The settings of this trainer in a task."""
         return getattr(task, self.settings_field)
 
+    def settings_at_rate(self, task: Task) -> TrainerSettings:
+        """The settings at the control rate of the vehicle: what counts steps of 0.01 s then counts control steps."""
+        return self.settings(task).at_rate(task.vehicle.control_rate)
+
     def with_steps(self, task: Task, steps: int) -> Task:
         """The task with a training of about `steps` environment steps, rounded up to whole updates.
 
@@ -122,22 +126,22 @@ class Trainer:
         from flytune.training.threads import keep_freed_memory
 
         keep_freed_memory()
-        return self._algorithm().start(task, self.settings(task), key)
+        return self._algorithm().start(task, self.settings_at_rate(task), key)
 
     def update(self, task: Task, train_state: Any) -> tuple[Any, dict[str, Any]]:
         """The training state after one update, and its metrics: `rollout_metrics` and the losses.
 
         The state before may not be used again.
         """
-        return self._algorithm().update(task, self.settings(task), train_state)
+        return self._algorithm().update(task, self.settings_at_rate(task), train_state)
 
     def policy(self, task: Task, train_state: Any) -> Policy:
         """The policy of the training: for PPO, of the moving average of the weights."""
-        return _completed(self._algorithm().policy(self.settings(task), train_state), task)
+        return _completed(self._algorithm().policy(self.settings_at_rate(task), train_state), task)
 
     def last_policy(self, task: Task, train_state: Any) -> Policy:
         """The policy of the last update."""
-        return _completed(self._algorithm().last_policy(self.settings(task), train_state), task)
+        return _completed(self._algorithm().last_policy(self.settings_at_rate(task), train_state), task)
 
     def warm_start(self, task: Task, train_state: Any, policy: Policy, critic: Critic | None = None) -> Any:
         """The training state before the first update, with an actor that gives the actions of `policy`.
@@ -148,7 +152,7 @@ class Trainer:
             BadInput: see `check_warm_start`.
         """
         self.check_warm_start(task, policy)
-        return self._algorithm().warm_start(self.settings(task), train_state, policy, critic)
+        return self._algorithm().warm_start(self.settings_at_rate(task), train_state, policy, critic)
 
     def check_warm_start(self, task: Task, policy: Policy, field: str = "warm_start") -> None:
         """Refuse a warm start that is not possible, before anything is written.

@@ -53,7 +53,7 @@ def _check_axis(
             cause = f"the speed bound of {float(end.limit):g} m/s you have set"
             compare(settling_time_bound(distance, float(end.limit)), cause, distance)
     gravity = float(task.vehicle.gravity)
-    thrust = float(task.vehicle.thrust_to_weight) * gravity
+    thrust = float(task.vehicle.full_thrust_to_weight) * gravity
     if axis == "position":
         climb = way[:, 2] / np.maximum(distance, 1e-9)
     else:

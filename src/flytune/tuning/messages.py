@@ -7,6 +7,7 @@ from typing import Any
 from flytune.evaluation.metrics import POSITION_BAND, YAW_BAND
 from flytune.tuning.iteration import HALF_WAY, Edit, Iteration
 from flytune.tuning.requirement import LARGEST_MISS, Requirement, ResponseSummary
+from flytune.tuning.rules import SHARES
 
 
 def line(topic: str, text: str) -> str:
@@ -25,20 +26,33 @@ def describe(
         notes: measure -> a note in brackets.
         bounds: whether the user has set constraints, which are then always mentioned.
     """
-    axes = {name: requirement.axis_of(name, response) for name in vars(response) if name != "axes"}
-    numbers = {name: with_unit(name, getattr(response, name), axis) for name, axis in axes.items()}
-    of = {name: f" ({axis})" if requirement.others else "" for name, axis in axes.items()}
-    settles = math.isfinite(response.settling_time)
+    notes = notes or {}
+
+    def told(measure: str) -> str:
+        """The number of each axis that is asked for; the note stands behind the one that counts."""
+        if measure in SHARES:
+            return with_unit(measure, getattr(response, measure))
+        leading = requirement.axis_of(measure, response)
+        values = response.each.get(measure) or {leading: getattr(response, measure)}
+        return ", ".join(
+            with_unit(measure, value, axis)
+            + f" ({axis})" * bool(requirement.others)
+            + notes.get(measure, "") * (axis == leading)
+            for axis, value in values.items()
+        )
+
+    times = response.each.get("settling_time", {"": response.settling_time})
+    settles = any(math.isfinite(value) for value in times.values())
+    never = f"does not settle{notes.get('settling_time', '')}"
     texts = {
-        "settling_time": (f"settles in {numbers['settling_time']}" if settles else "does not settle")
-        + of["settling_time"],
-        "overshoot": f"overshoot {numbers['overshoot']}{of['overshoot']}",
-        "error": f"error {numbers['error']}{of['error']}",
-        "settled": f"{numbers['settled']} settled",
-        "constraints_satisfied": f"your constraints are satisfied in {numbers['constraints_satisfied']}",
+        "settling_time": f"settles in {told('settling_time')}" if settles else never,
+        "overshoot": f"overshoot {told('overshoot')}",
+        "error": f"error {told('error')}",
+        "settled": f"{told('settled')} settled",
+        "constraints_satisfied": f"your constraints are satisfied in {told('constraints_satisfied')}",
     }
     shown = [name for name in texts if name != "constraints_satisfied" or bounds or response.constraints_satisfied < 1]
-    return ", ".join(texts[name] + (notes or {}).get(name, "") for name in shown)
+    return ", ".join(texts[name] + (notes.get(name, "") if name in SHARES else "") for name in shown)
 
 
 def describe_target(target: Requirement, trials: int, duration: float) -> str:

@@ -31,16 +31,24 @@ class ResponseSummary:
     settled: float  # share of the trials, on all axes asked for
     constraints_satisfied: float  # share of the feasible trials that violate no constraint of the user
     axes: Mapping[str, str] = dataclasses.field(default_factory=dict)  # measure -> its axis, where not the leading one
+    # measure -> axis -> its number, where several axes are asked for
+    each: Mapping[str, Mapping[str, float]] = dataclasses.field(default_factory=dict)
 
     def to_dict(self) -> dict[str, Any]:
         """Plain numbers, None where infinite."""
-        return {name: None if value == math.inf else value for name, value in dataclasses.asdict(self).items()}
+        return _replaced(dataclasses.asdict(self), math.inf, None)
 
     @classmethod
     def from_dict(cls, numbers: dict[str, Any]) -> "ResponseSummary":
         """The summary that `to_dict` has written."""
-        restored: dict[str, Any] = {name: math.inf if value is None else value for name, value in numbers.items()}
-        return cls(**restored)
+        return cls(**_replaced(numbers, None, math.inf))
+
+
+def _replaced(numbers: Any, old: float | None, new: float | None) -> Any:
+    """Nested tables with one value in the place of another."""
+    if isinstance(numbers, dict):
+        return {name: _replaced(value, old, new) for name, value in numbers.items()}
+    return new if numbers == old else numbers
 
 
 NO_RESPONSE = ResponseSummary(
@@ -146,6 +154,7 @@ class Requirement(AxisLimits):
             settled=float(np.mean(np.logical_and.reduce([np.isfinite(each) for each in times.values()]))),
             constraints_satisfied=float(1 - np.mean(broken[feasible])) if feasible.any() else 1.0,
             axes={measure: axis for measure, axis in axes.items() if axis != self.axis},
+            each=measured if self.others else {},
         )
 
     def _worst_axis(self, measure: str, values: Mapping[str, float]) -> str:

@@ -12,6 +12,7 @@ from annotated_types import Gt
 from flytune.config import document, nested
 from flytune.config.document import Real
 from flytune.config.pytree import pytree
+from flytune.config.recognise import RULES, misplaced
 from flytune.errors import BadInput
 from flytune.tables import Table
 from flytune.task.task import Task
@@ -86,7 +87,9 @@ def load_rules(extra: str | Path | None = None) -> list[Rule]:
 
 
 def _read(path: Path) -> list[Rule]:
-    tables = document.load(path).get("rule")
+    if line := misplaced(str(path), RULES):
+        raise BadInput(f"rules: {line}")
+    tables = document.load(path, remedy="Give a TOML file with tables [[rule]].").get("rule")
     if not isinstance(tables, list) or not tables:
         raise BadInput(f"{path}: holds no rule. Allowed: one or more tables [[rule]].")
     return [document.read(Rule, table, f"{path}: rule {number}") for number, table in enumerate(tables, start=1)]

@@ -12,6 +12,7 @@ from flytune.config.files import RUN_FILES, held, make_folder
 from flytune.errors import BadInput, Interrupted
 from flytune.report.tuning import write_tuning
 from flytune.runs.naming import new_directory, run_name
+from flytune.task.files import load_task
 from flytune.training.progress import Progress
 from flytune.training.trainer import DEFAULT_TRAINER, find_trainer
 from flytune.tuning.asked import OVERSHOOT, PERCENTILE, PerAxis, make_requirement
@@ -20,6 +21,7 @@ from flytune.tuning.messages import line
 from flytune.tuning.requirement import Requirement
 from flytune.tuning.result import Tuning
 from flytune.tuning.rules import Rule, load_rules
+from flytune.tuning.start import WITHOUT_POLICY
 
 
 def tune(
@@ -137,7 +139,7 @@ def _directory(
         usual = {**vars(make_requirement(requirement.settling_time)), "task": None, "edits": {}}
         usual |= {"trainer": DEFAULT_TRAINER, "seed": 0}
         changes = {name: value for name, value in asked.items() if value != usual[name]}
-        return new_directory(run_name(f"tune-{requirement.settling_time:g}s", changes))
+        return new_directory(run_name(directory_name(requirement, asked["task"], asked["edits"]), changes))
     directory = Path(out)
     # not Path.exists, which raises where a name is too long
     if os.path.exists(directory) and not os.path.isdir(directory):
@@ -145,6 +147,17 @@ def _directory(
     if not resume:
         _check_new(directory)
     return contextlib.nullcontext(directory)
+
+
+def directory_name(requirement: Requirement, task: str | None, edits: Mapping[str, Any]) -> str:
+    """The name of a tuning: its task and vehicle where they are not the usual ones, and the settling time.
+
+    Raises:
+        BadInput: no such task, or a bad edit.
+    """
+    wanted, usual = load_task(task or WITHOUT_POLICY, dict(edits)), load_task(WITHOUT_POLICY)
+    words = [wanted.name] * bool(task) + [wanted.vehicle.name] * (wanted.vehicle.name != usual.vehicle.name)
+    return "-".join(["tune", *words, f"{requirement.settling_time:g}s"])
 
 
 def _check_new(directory: Path) -> None:

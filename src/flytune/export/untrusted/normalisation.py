@@ -117,10 +117,21 @@ def find_statistics(model: Path) -> Path | None:
         names.append(f"{steps[1]}_vecnormalize_{steps[2]}")
     names += ["vecnormalize", "vec_normalize"]
     places = [model.with_name(f"{name}{end}") for name in names for end in (".pkl", ".npz")]
-    below = sorted(
-        model.parent.glob("*/vecnormalize.pkl")
-    )  # where RL Zoo keeps it, in a folder named as the environment
+    below = in_folders(model)
     return next((place for place in places + below[:1] * (len(below) == 1) if place.is_file()), None)
+
+
+def in_folders(model: Path) -> list[Path]:
+    """The files of statistics in the folders beside a model; RL Zoo keeps them in one named as the environment."""
+    return sorted(model.parent.glob("*/vecnormalize.pkl"))
+
+
+def where_looked(model: Path) -> str:
+    """Where `find_statistics` has looked without success, as a sentence."""
+    below = [str(each.relative_to(model.parent)) for each in in_folders(model)]
+    if len(below) > 1:
+        return f"Several may belong to it: {', '.join(below[:3])}{', ...' * (len(below) > 3)}."
+    return "There is no vecnormalize.pkl beside the model, nor in a folder there."
 
 
 def read_statistics(path: Path) -> Statistics | None:

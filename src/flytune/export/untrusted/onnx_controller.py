@@ -14,7 +14,15 @@ from jaxtyping import Array, Float
 from flytune.config.pytree import label, pytree, static
 from flytune.control.policy import CONVENTIONS
 from flytune.errors import BadInput, require
-from flytune.export.untrusted.onnx_inspection import DIALS, FORMAT, VERSION, inspect, metadata, read_dials
+from flytune.export.untrusted.onnx_inspection import (
+    DIALS,
+    FORMAT,
+    VERSION,
+    conventions_of,
+    inspect,
+    metadata,
+    read_dials,
+)
 from flytune.export.untrusted.onnx_shapes import Ports, find_ports
 from flytune.export.untrusted.sandbox import LOAD_TIME, SANDBOX, STEP_TIME, Stopped
 from flytune.task.dial import Dial, Setting, checked_setting
@@ -186,7 +194,11 @@ def read_onnx(content: bytes, where: str) -> OnnxController:
         _probe(session, np.asarray([list(setting.values())], np.float32))
     except BadInput as error:
         raise BadInput(f"{where}: {error}") from None
-    about = {key: value for key, value in metadata(model).items() if key not in {*CONVENTIONS, DIALS, FORMAT, VERSION}}
+    found = metadata(model)
+    about: dict[str, Any] = {
+        key: value for key, value in found.items() if key not in {*CONVENTIONS, DIALS, FORMAT, VERSION}
+    }
+    about |= conventions_of(found)
     return OnnxController(session=session, dials=dials, setting=setting, about=about)
 
 

@@ -6,15 +6,17 @@ process with limits of memory and time (`sandbox`).
 """
 
 import json
-from collections.abc import Iterator
+import re
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import numpy as np
 
-from flytune.control.policy import CONVENTIONS
+from flytune.control.policy import ACTIONS, CONVENTIONS
 from flytune.errors import BadInput, require
 from flytune.export.untrusted.onnx_size import LARGEST_MESSAGES, count_messages, count_nodes
 from flytune.task.dial import Dial, read_named
+from flytune.task.observation import RATE
 
 INPUT, OUTPUT = "observation", "action"
 DIAL_INPUT, DIALS = "dial", "dials"  # a second input, and the metadata entry that describes it, of a policy with dials
@@ -24,6 +26,10 @@ OLDEST = 7  # the first operator set that onnxruntime runs
 CONTROL_FLOW = {"If", "Loop", "Scan", "SequenceMap"}
 RANDOM = {"Bernoulli", "Multinomial", "RandomNormal", "RandomNormalLike", "RandomUniform", "RandomUniformLike"}
 STANDARD = ("", "ai.onnx")
+OTHERS = {  # what is allowed of an entry beside the usual
+    "rate": ", or another of 50 to 1000 Hz",
+    "action": "".join(f", or {text!r}" for text in list(ACTIONS.values())[1:]),
+}
 
 
 def inspect(content: bytes, where: str) -> Any:
@@ -164,12 +170,31 @@ def _refuse_other_conventions(model: Any, where: str) -> None:
     found = metadata(model)
     # a graph does not say what its numbers mean: a model without these entries in its metadata is refused
     for key, wanted in CONVENTIONS.items():
-        if found.get(key) != wanted:
+        if not _is_known(key, found.get(key)):
             has = f"is {shown(found[key])}" if key in found else "is missing"
             raise BadInput(
-                f"{where}: the metadata entry {key!r} {has}. Allowed: {wanted!r}. If the model follows this, set it: "
-                "onnx.helper.set_model_props(model, flytune.export.onnx.CONVENTIONS)."
+                f"{where}: the metadata entry {key!r} {has}. Allowed: {wanted!r}{OTHERS.get(key, '')}. If the model "
+                "follows this, set it: onnx.helper.set_model_props(model, flytune.export.onnx.CONVENTIONS)."
             )
+
+
+def _is_known(key: str, value: str | None) -> bool:
+    """Whether a convention is one that flytune can fly."""
+    if key == "action":
+        return value in ACTIONS.values()
+    if key == "rate":
+        number = re.fullmatch(r"(\d{2,4}) Hz", value or "")
+        return number is not None and 50 <= int(number[1]) <= 1000
+    return value == CONVENTIONS[key]
+
+
+def conventions_of(found: Mapping[str, str]) -> dict[str, Any]:
+    """The facts of `conventions` from the metadata of a model that was inspected; the usual ones are left out."""
+    rate = int(found["rate"].removesuffix(" Hz"))
+    convention = next(name for name, text in ACTIONS.items() if text == found["action"])
+    return ({} if rate == RATE else {"control_rate": rate}) | (
+        {} if convention == "hover_relative" else {"action_convention": convention}
+    )
 
 
 def _refuse_broken_numbers(onnx: Any, model: Any, where: str) -> None:

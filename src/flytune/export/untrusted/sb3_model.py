@@ -20,6 +20,7 @@ from flytune.export.untrusted.normalisation import (
     read_statistics,
     refuse_misfit,
     scaling_of,
+    where_looked,
     why_scaled,
 )
 from flytune.export.untrusted.pickled import Reader
@@ -101,7 +102,7 @@ def _statistics(path: Path, about: dict[str, Any], given: Path | Literal["none"]
     beside = find_statistics(path)
     if given is None and scaling == "unknown" and beside:
         raise BadInput(
-            f"{path}: does not say whether its observations were scaled, and {beside.name} stands beside it. "
+            f"{path}: does not say whether its observations were scaled, and {beside} may belong to it. "
             f"Give {named}{beside} to use that, or {named}none."
         )
     if given == "none" or (given is None and scaling != "scaled"):
@@ -111,8 +112,8 @@ def _statistics(path: Path, about: dict[str, Any], given: Path | Literal["none"]
     source = given or beside
     if source is None:
         raise BadInput(
-            f"{path}: {why_scaled(about, last)} Give the statistics that VecNormalize.save wrote: as vecnormalize.pkl "
-            f"beside the model, or as {named}FILE."
+            f"{path}: {why_scaled(about, last)} {where_looked(path)} Give the statistics that VecNormalize.save wrote: "
+            f"as vecnormalize.pkl beside the model, or as {named}FILE."
         )
     found = read_statistics(Path(source))
     if found is None and scaling == "scaled" and last is not None:
