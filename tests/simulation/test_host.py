@@ -178,3 +178,18 @@ def test_a_task_with_a_dial_is_refused_and_at_one_setting_it_is_not():
     with pytest.raises(BadInput, match="task: dial has a dial"):
         make(family)
     assert make(family.at({"speed": 0.3})).observation.shape == (NUMBER, 17)
+
+
+@pytest.mark.parametrize("simulator", [JaxSimulator, OnTheHost])
+def test_a_target_that_moves_is_seen_where_it_is_at_each_step(simulator):
+    circle = {"target.kind": "circle", "target.radius": 0.5, "target.facing": "along_path"}
+    moving = make(load_task("baseline", {**QUIET, **circle}), seed=2, simulator=simulator)
+    for step in range(1, 4):
+        moving.step(np.zeros((NUMBER, 4), np.float32))
+        angle = 0.5 / 0.5 * 0.01 * step
+        place, heading = [0.5 * np.cos(angle), 0.5 * np.sin(angle), 1.0], angle + np.pi / 2
+        c, s = np.cos(heading), np.sin(heading)
+        turn = np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]])
+        np.testing.assert_allclose(moving.observation[:, :3], (moving.states[:, :3] - place) @ turn.T, atol=2e-6)
+        relative = moving.states[:, 7:10] - 0.5 * np.array([-np.sin(angle), np.cos(angle), 0])
+        np.testing.assert_allclose(moving.observation[:, 7:10], relative @ turn.T, atol=2e-6)
