@@ -9,8 +9,9 @@ import pytest
 
 from flytune.config.pytree import pytree
 from flytune.errors import BadInput, Diverged
-from flytune.evaluation.fly import _begin, fly, rollout_trials, trial_keys
+from flytune.evaluation.fly import fly
 from flytune.evaluation.judge import judge
+from flytune.evaluation.trials import begin_trials, rollout_trials, trial_keys
 from flytune.physics.dynamics import hovering
 from flytune.simulation.jax_simulator import JaxSimulator
 from flytune.simulation.simulators import make_simulator
@@ -149,7 +150,7 @@ def test_a_crash_is_counted_and_held_and_the_others_fly_on(task, own, simulator)
 @pytest.mark.parametrize("lost", [0, 3])  # some crash on the way; some begin lost
 def test_a_crashed_vehicle_waits_at_the_target(task, simulator, lost):
     made = make_simulator(simulator, task.vehicle, 8) if isinstance(simulator, str) else simulator(task.vehicle, 8)
-    starts, noise_keys = _begin(task, trial_keys(1, 8))
+    starts, noise_keys = begin_trials(task, trial_keys(1, 8))
     starts = starts.at[0, :lost].add(15.0)
     crashed = rollout_trials(made, Diver(), task, starts, noise_keys, 200, "diver").crashed
     assert crashed[:lost].all()

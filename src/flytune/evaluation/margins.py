@@ -30,7 +30,7 @@ def recorded_margins(
         states: the true states, see `state_numbers`.
         actions: the action before each state.
     """
-    changes, samples = np.diff(actions, axis=0, prepend=np.zeros_like(actions[:1])), len(states)
+    changes, samples = np.diff(actions, axis=0, prepend=actions[:1]), len(states)
     parts = []
     for first in range(0, samples, CHUNK):
         rows = np.minimum(np.arange(first, first + CHUNK), samples - 1)
