@@ -93,7 +93,14 @@ class Grid:
 
 
 def make_grid(where: str, time: Float[np.ndarray, "L"], start: float, end: float, longest_gap: float) -> Grid:
-    """The instants of the judge from `start` to `end`, in s on the clock of the log.
+    """The instants of the judge, in s on the clock of the log.
+
+    Args:
+        where: the beginning of a message.
+        time: of the samples in s.
+        start: of the flight in s.
+        end: of the flight in s.
+        longest_gap: between two samples in s, beyond which nothing is interpolated.
 
     Raises:
         BadInput: the flight is shorter than the window of the steady state.

@@ -117,6 +117,12 @@ def rotor_speed_after(vehicle: Vehicle, now: Components, commanded: Components, 
         rpm(t) = command + (rpm(0) - command) exp(-t / tau),  tau by whether the rotor speeds up or slows down
 
     A time constant of zero follows at once, also for elapsed = 0.
+
+    Args:
+        vehicle: its time constants.
+        now: rotor speeds in rpm.
+        commanded: likewise.
+        elapsed: in s.
     """
 
     def share_left(time_constant: float | Float[Array, ""]) -> Float[Array, ""]:

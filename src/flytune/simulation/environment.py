@@ -88,13 +88,26 @@ def step(
     """The episode one control period later, and the result of the step, computed from the true state.
 
     The action is clipped to [-1, 1]; the clipped action is flown, penalised and later observed (paper R9).
+
+    Args:
+        task: the member of the family that the episode flies.
+        episode: before the step.
+        action: of each motor.
+        physics: the simulator's step.
     """
     action = jnp.clip(action, -1.0, 1.0)
     return assess(task, episode, physics(task.vehicle, episode.state, action), action)
 
 
 def assess(task: Task, episode: Episode, state: State, action: Float[Array, "4"]) -> tuple[Episode, Outcome]:
-    """The episode in the state that a clipped action led to, and the result of the step, for any simulator."""
+    """The episode in the state that a clipped action led to, and the result of the step, for any simulator.
+
+    Args:
+        task: the member of the family that the episode flies.
+        episode: before the step.
+        state: after it.
+        action: that led there, clipped to [-1, 1].
+    """
     steps = episode.steps + 1
     here = situation(task.reference(steps), state, per_unit_time(task.vehicle, action - episode.last_action))
     terms = rewards(task.reward, here)
@@ -132,6 +145,12 @@ def with_slack(task: Task, moved: Episode, outcome: Outcome, slack: Any) -> Outc
 
     Where an episode ends at the bound itself, a gradient never sees what lies beyond: a barrier is then weakest just
     where it is needed.
+
+    Args:
+        task: of the episode.
+        moved: the episode after the step.
+        outcome: of the step, with episodes that end at the bounds themselves.
+        slack: share of a bound; 0 for none.
     """
     beyond = cause({name: margin + slack * task.termination[name].slack for name, margin in outcome.margins.items()})
     terminated = beyond != SAFE
@@ -142,7 +161,15 @@ def with_slack(task: Task, moved: Episode, outcome: Outcome, slack: Any) -> Outc
 def restart(
     family: TaskFamily, before: Episode, moved: Episode, outcome: Outcome, key: jax.Array
 ) -> tuple[Episode, Bool[Array, ""]]:
-    """The episode itself, or a new one drawn with `key` where it is over; and whether it is over."""
+    """The episode itself, or a new one where it is over; and whether it is over.
+
+    Args:
+        family: that a new episode is drawn from.
+        before: the episode before the step.
+        moved: after it.
+        outcome: of the step.
+        key: that a new episode is drawn with.
+    """
     over = outcome.terminated | outcome.truncated
     return jax.tree.map(lambda new, old: jnp.where(over, new, old), reset(family, key), moved), over
 
@@ -152,7 +179,7 @@ def hold(
 ) -> tuple[Episode, Bool[Array, ""]]:
     """The episode itself, or from a crash on the one before it; and whether the vehicle has crashed.
 
-    Terminations end nothing here. The steps of a held episode are -1.
+    Terminations end nothing here. The steps of a held episode are -1. The arguments are those of `restart`.
     """
     crashed = (before.steps < 0) | is_crashed(family.member(moved.numbers), moved.state, moved.steps)
     held = dataclasses.replace(before, steps=jnp.full_like(before.steps, -1))

@@ -191,7 +191,15 @@ def _flat(samples: Array) -> Array:
 def rollout(
     task: Task, settings: PpoSettings, parameters: Parameters, episodes: Episode, key: Array
 ) -> tuple[Episode, Batch, dict[str, Any]]:
-    """The episodes after `settings.rollout` steps, the samples [time, environment, ...], and their sums."""
+    """The episodes after a rollout, the samples [time, environment, ...], and their sums.
+
+    Args:
+        task: of the episodes, or their family.
+        settings: `rollout` steps are simulated in `environments` episodes.
+        parameters: of actor, critic and exploration.
+        episodes: before the rollout, the batch along the last axis.
+        key: of noise, exploration and new episodes.
+    """
     noise_key, action_key, reset_key = jax.random.split(key, 3)
     steps, width = settings.rollout, settings.environments
     noise = jax.random.split(noise_key, (steps + 1, width))
@@ -254,8 +262,15 @@ def advantages(
         delta_t = r_t + discount * V(s_{t+1}) * (not terminated) - V(s_t)
         A_t     = delta_t + discount * lambda * (not ended) * A_{t+1}
 
-    `next_value` is the value of the state an action led to, before any reset, so that truncation bootstraps and
-    termination does not.
+    Args:
+        reward: of each step.
+        value: V(s_t).
+        next_value: of the state an action led to, before any reset, so that truncation bootstraps and termination does
+            not.
+        terminated: whether the episode failed in this step.
+        ended: whether it is over for any reason.
+        discount: per step.
+        gae_lambda: lambda, per step.
 
     Source: Schulman et al. 2016, equation 16; Pardo et al. 2018.
     """
@@ -272,7 +287,16 @@ def advantages(
 def learn(
     settings: PpoSettings, parameters: Parameters, optimiser: Any, batch: Batch, key: Array, threads: Any = 1
 ) -> tuple[Parameters, Any, dict[str, Array]]:
-    """Parameters and optimiser after all epochs over the samples [S, ...], and the mean losses of the last epoch."""
+    """Parameters and optimiser after all epochs over the samples [S, ...], and the mean losses of the last epoch.
+
+    Args:
+        settings: of the surrogate, the minibatches and the optimiser.
+        parameters: before.
+        optimiser: its moments before.
+        batch: the samples.
+        key: of their order in each epoch.
+        threads: 1 or 2, where kernels run.
+    """
     shuffled = orders(jax.random.split(key, settings.epochs), batch.action.shape[0])
     return learn_in_order(settings, parameters, optimiser, batch, shuffled, threads)
 
