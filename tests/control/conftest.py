@@ -21,7 +21,7 @@ def baseline():
 @pytest.fixture(scope="session")
 def observation():
     """Factory of noise-free observations [17] of a vehicle at a position and attitude (roll, pitch, yaw)."""
-    see = jax.jit(lambda task, state, last: observe(task.target, task.noise, state, last, jnp.zeros(13)))
+    see = jax.jit(lambda task, state, last: observe(task.reference(0), task.noise, state, last, jnp.zeros(13)))
 
     def make(task, position=None, angles=(0, 0, 0), velocity=(0, 0, 0), body_rate=(0, 0, 0), last_action=(0, 0, 0, 0)):
         place = task.target.position if position is None else position
@@ -45,7 +45,9 @@ def calm_flight():
         def one(position, angle):
             def advance(carry, _):
                 state, last, memory = carry
-                memory, action = controller.act(memory, observe(task.target, task.noise, state, last, jnp.zeros(13)))
+                memory, action = controller.act(
+                    memory, observe(task.reference(0), task.noise, state, last, jnp.zeros(13))
+                )
                 state = dynamics.step(task.vehicle, state, action)
                 return (state, action, memory), (state, action)
 

@@ -68,7 +68,7 @@ def test_a_step_is_physics_then_situation_then_rewards_and_margins(compiled, bas
     before = episode(baseline, position=(0.4, -0.2, 1.1), velocity=(0.1, 0.0, 0.2), last_action=(0.1, 0.1, 0.0, 0.0))
     after, outcome = compiled["step"](baseline, before, jnp.array(ACTION))
     state = jax.jit(dynamics.step)(baseline.vehicle, before.state, jnp.array(ACTION))
-    here = situation(baseline.target, state, jnp.array(ACTION) - before.last_action)
+    here = situation(baseline.reference(0), state, jnp.array(ACTION) - before.last_action)
     terms = rewards(baseline.reward, here)
     same(after.state, state, rtol=1e-6, atol=1e-7)
     same(outcome.terms, terms, rtol=1e-5, atol=1e-7)
@@ -103,7 +103,7 @@ def test_the_clipped_action_is_flown_penalised_and_observed(compiled, baseline):
 def test_what_the_pilot_sees_is_the_observation_of_the_episode(compiled, baseline):
     here = episode(baseline, position=(0.4, -0.2, 1.1), last_action=ACTION)
     normal = jax.random.normal(jax.random.key(0), (13,))
-    expected = observe(baseline.target, baseline.noise, here.state, here.last_action, normal)
+    expected = observe(baseline.reference(0), baseline.noise, here.state, here.last_action, normal)
     np.testing.assert_allclose(compiled["observe"](baseline, here, normal), expected, rtol=1e-6, atol=1e-7)
 
 
