@@ -79,7 +79,7 @@ def test_a_command_explains_every_option_it_has(command, capsys):
     listed = [
         line.split()[0]
         for line in words
-        if line.split() and line.split()[0].startswith(("--", "TASK", "CONT", "WHAT", "FILE", "SHELL"))
+        if line.split() and line.split()[0].startswith(("--", "TASK", "CONT", "WHAT", "FILE", "SHELL", "VEHICLE"))
     ]
     assert [name for name in OPTIONS[command].split() if name not in listed] == []
 

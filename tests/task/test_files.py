@@ -131,7 +131,7 @@ def test_a_complete_vehicle_keeps_nothing_of_the_base(tmp_path):
     table = document.plain(airframe("hummingbird x")) | {"sources": {}}
     text = "\n".join(f"{name} = {value!r}".replace("'", '"') for name, value in table.items() if name != "sources")
     task = load_task(write(tmp_path / "mine.toml", f'based_on = "baseline"\n[vehicle]\n{text}'))
-    assert task.vehicle.name == "hummingbird"
+    assert task.vehicle.name == "hummingbird x"
     assert task.vehicle.optional_rotor_drag is None and task.vehicle.ground_effect is None
 
 

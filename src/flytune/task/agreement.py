@@ -66,7 +66,7 @@ def disagreement(task: Task, initial_state: InitialState, where: str, slack: flo
         if end.quantity == "altitude" and not height > end.limit:
             return (
                 f"termination.{name}.bound: {end.limit:g} m is not below the target, which is {height:g} m high, so "
-                f"that an episode ends before it arrives. Give a bound below {height:g} m, or a higher target.position."
+                f"that an episode ends before it arrives. Give a bound below {height:g} m, or a higher target."
             )
     rate = task.limit("body_rate")
     measures, inside = _starts(task, initial_state, np.float32(slack), np.float32(math.inf if rate is None else rate))

@@ -48,7 +48,7 @@ class InitialState:
             return None
         return (
             f"lowest_altitude: {float(self.lowest_altitude):g} m lies above all starts, whose box ends at {highest:g} "
-            f"m for a target at {float(target.position[2]):g} m. Give a lower one, or a higher target.position."
+            f"m for a target at {float(target.position[2]):g} m. Give a lower one, or a higher target."
         )
 
     def moved(self, target: Target) -> Components:
