@@ -75,6 +75,7 @@ def test_evaluate_prints_exactly_one_json_object_with_the_keys_of_the_contract(f
     assert list(judged) == [
         "schema", "who", "task", "vehicle", "world", "trials", "seed", "starts", "duration", "axes", "position",
         "secondary", "infeasible", "crashed", "violations", "peak_speed", "action", "efficiency", "dial",
+        "conditions",
     ]  # fmt: skip
     assert set(judged["axes"]) == {"x", "y", "z", "yaw"}
     assert json.loads((folder / run / "evaluation.json").read_text()) == judged

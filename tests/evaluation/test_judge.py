@@ -41,7 +41,7 @@ def test_the_dictionary_has_the_published_keys_and_is_json(make_flights):
     assert list(judged) == [
         "schema", "who", "task", "vehicle", "world", "trials", "seed", "starts", "duration", "axes", "position",
         "secondary", "infeasible", "crashed", "violations", "peak_speed", "action", "efficiency",
-        "dial",
+        "dial", "conditions",
     ]  # fmt: skip
     assert list(judged["axes"]) == ["x", "y", "z", "yaw"]
     of_axis = {"settling_time": TIMES, "rise_time": TIMES, "overshoot": OVERSHOOTS, "overshoot_raw": OVERSHOOTS,

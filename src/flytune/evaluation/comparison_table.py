@@ -149,7 +149,8 @@ def _clause(difference: Difference, against: str, whole: bool) -> str:
     if math.isinf(difference.median):
         worse, better = metric.outcomes
         mine, other = (worse, better) if difference.median > 0 else (better, worse)
-        return f"{name}{mine} where {against} {other}{_interval(difference)}, {_counts(difference)}"
+        about = "" if metric.field == "settling_time" else f"{metric.title}: "  # whose sentence would be of the crash
+        return f"{about}{name}{mine} where {against} {other}{_interval(difference)}, {_counts(difference)}"
     unit, scale = metric.shown
     unit = {"1": "", "%": " % of the step"}.get(unit, f" {unit}")
     said = f"{metric.equal} {against}"

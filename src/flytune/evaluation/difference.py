@@ -56,7 +56,7 @@ class Metric:
         """What a controller does in a trial without a number, and what in one with a number, for a sentence."""
         if self.field == "settling_time":
             return self.verb.replace("settles", "does not settle"), self.verb
-        return "crashes", "does not"
+        return "crashes", "does not crash"
 
     @property
     def neither(self) -> str:
