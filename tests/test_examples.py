@@ -41,7 +41,7 @@ SHOWS = {
 
 
 EXTENDS = {"own_simulator"}  # it builds on flytune's own physics
-SLOW = {"own_reward_term"}  # it compiles a training of its own
+SLOW = {"own_reward_term", "turn_a_dial", "train_and_judge"}  # they compile what nothing else does
 FLOOR = {"tune_to_a_response"}
 
 

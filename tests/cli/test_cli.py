@@ -202,6 +202,7 @@ def test_a_training_that_diverges_ends_with_exit_code_three_and_says_what_and_wh
     assert re.search(r"is -?(nan|inf) in update \d+", answer.stderr)
 
 
+@pytest.mark.slow
 def test_ctrl_c_saves_a_checkpoint_exits_with_130_and_resumes_to_the_same_policy(folder):
     edits = [edit for edit in SMALL if "updates" not in edit] + ["apg.updates=40"]
     train = ["train", "baseline", "--set", *edits]

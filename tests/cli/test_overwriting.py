@@ -89,6 +89,7 @@ def test_what_somebody_else_wrote_is_not_replaced(here, capsys, arguments, reaso
     assert files(here) == before
 
 
+@pytest.mark.slow
 def test_what_flytune_wrote_is_replaced_by_one_of_its_kind_and_so_is_an_empty_file(here):
     for name in ("f.npz", "page.html", "p.onnx", "p.safetensors"):
         (here / name).touch()

@@ -176,6 +176,7 @@ EVERY = [pytest.param(*each, id=named(each[0])) for each in REMEDIES]
 EVERY += [pytest.param(*each, marks=pytest.mark.slow, id=named(each[0])) for each in OF_WHOLE_TRAININGS]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("typed", "said", "remedy"), EVERY)
 def test_what_a_message_tells_to_do_works(here, capsys, typed, said, remedy):
     line = refused(*typed, capsys=capsys)
@@ -188,6 +189,7 @@ def test_what_a_message_tells_to_do_works(here, capsys, typed, said, remedy):
     assert main(remedy(typed, match)) == 0, capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_a_smaller_learning_rate_helps_a_training_that_diverged(here, capsys):
     words = ["train", "mine/task.toml", "--set", "apg.learning_rate=1e38"]
     assert main(words) == 3
@@ -195,6 +197,7 @@ def test_a_smaller_learning_rate_helps_a_training_that_diverged(here, capsys):
     assert main([*words, f"{field}=0.005"]) == 0
 
 
+@pytest.mark.slow
 def test_what_is_damaged_is_trained_again_into_another_directory_as_the_message_says(here, capsys):
     task = ["train", "mine/task.toml"]
     for spoil, typed in (
@@ -217,6 +220,7 @@ def test_what_is_damaged_is_trained_again_into_another_directory_as_the_message_
     assert main(MINE) == 0
 
 
+@pytest.mark.slow
 def test_a_policy_whose_response_map_is_of_no_use_flies_by_its_dial_and_is_measured_again(here, capsys):
     policy = flytune.find_controller("dial").controller
     none = {**policy.maps["speed"], "monotone": [None] * len(policy.maps["speed"]["values"])}

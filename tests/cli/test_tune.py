@@ -82,6 +82,7 @@ def test_several_axes_are_asked_for_at_once_each_with_its_own_bounds(tmp_path):
     assert "yaw: settling time, percentile 90" in page and "yaw: overshoot, median" in page
 
 
+@pytest.mark.slow
 def test_what_cannot_be_met_ends_with_code_4_the_reason_and_the_best_so_far(tmp_path):
     arguments = ["tune", "baseline-refined", "--settling-time", "6", "--iterations", "1", "--set", "apg.updates=1"]
     answer = flytune(*arguments, "--out", "mine", cwd=tmp_path, expect=4)
@@ -108,6 +109,7 @@ def test_an_interrupted_tuning_keeps_its_steps_and_goes_on(tmp_path):
     assert json.loads((tmp_path / "mine" / "tune.json").read_text()) == after
 
 
+@pytest.mark.slow
 def test_an_interrupted_first_training_goes_on_where_it_was(tmp_path):
     arguments = ["tune", "baseline", "--settling-time", "5", "--out", "mine", "--steps", "1", "--set", "apg.updates=30"]
     message = interrupted(*arguments, cwd=tmp_path, at="50 %")

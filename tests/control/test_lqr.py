@@ -18,7 +18,13 @@ H = 0.01
 SETS = ("textbook", "tuned")
 
 
-@pytest.fixture(scope="module", params=vehicle_names())
+FEW = ("crazyflie", "crazyflie-measured", "hummingbird")
+
+
+@pytest.fixture(
+    scope="module",
+    params=[pytest.param(name, marks=[pytest.mark.slow] * (name not in FEW)) for name in vehicle_names()],
+)
 def vehicle(request):
     """Every vehicle that ships."""
     return load_vehicle(request.param)

@@ -15,6 +15,8 @@ from flytune.evaluation.fly import fly
 from flytune.runs.shipped import shipped_files
 from flytune.task.files import load_task
 
+pytestmark = pytest.mark.slow
+
 CONTROLLERS = (*CLASSICAL, "policy")
 PARTS = ("target", "initial_state", "noise", "termination", "vehicle")
 BASELINE = load_task("baseline")

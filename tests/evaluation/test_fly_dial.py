@@ -29,6 +29,7 @@ def test_the_bound_of_a_flight_is_that_of_the_setting():
     assert fly(find_controller("pid", FAMILY), FAMILY, trials=2, duration=1.0).speed_bound == pytest.approx(0.8)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("to", [0.2, 1.6])
 @pytest.mark.parametrize("at", [0.05, 0.5, 1.5, 6.0])
 def test_the_dial_may_be_turned_at_every_phase_of_a_flight(at, to):
@@ -58,6 +59,7 @@ def test_a_turn_moves_the_dial_no_faster_than_its_sweep_time():
     assert flights.speed_bound == pytest.approx(1.6)
 
 
+@pytest.mark.slow
 def test_a_schedule_flies_the_same_in_another_simulator():
     pytest.importorskip("mujoco")
     schedule = {"speed": [[0, 0.4], [2.0, 1.2]]}
@@ -68,6 +70,7 @@ def test_a_schedule_flies_the_same_in_another_simulator():
     assert np.abs(here.position - there.position).max() < 0.05
 
 
+@pytest.mark.slow
 def test_a_schedule_flies_the_same_from_an_onnx_file(tmp_path):
     pytest.importorskip("onnxruntime")
     path = export_policy(POLICY, tmp_path / "dial.onnx")
@@ -197,6 +200,7 @@ def test_what_has_no_weights_at_one_setting_is_not_exported(tmp_path, capsys, na
     assert not (tmp_path / "out.onnx").exists()
 
 
+@pytest.mark.slow
 def test_the_map_of_an_onnx_file_is_measured_and_that_of_a_schedule_is_the_policys(tmp_path, capsys):
     pytest.importorskip("onnxruntime")
     path = export_policy(POLICY, tmp_path / "dial.onnx")

@@ -32,6 +32,7 @@ def a_map(values, times, settled=None):
     )  # fmt: skip
 
 
+@pytest.mark.slow
 def test_the_map_that_ships_was_measured_with_the_policy_that_ships():
     carried = response_map(the_policy())
     assert carried is not None

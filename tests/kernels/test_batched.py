@@ -117,12 +117,17 @@ TASKS = {preset: (preset, {}) for preset in preset_names()} | {
 }
 
 
-@pytest.mark.parametrize("name", TASKS)
+# these have every term of the equations and every structure of a task
+FEW = ("baseline", "dial", "inspection-refined", "crazyflie-b500", "hummingbird", "racer")
+
+
+@pytest.mark.parametrize("name", [pytest.param(name, marks=[pytest.mark.slow] * (name not in FEW)) for name in TASKS])
 def test_a_step_and_its_gradient_are_those_of_jax(name):
     preset, edits = TASKS[name]
     _compare(load_task(preset, edits))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("layout", LAYOUTS)
 def test_a_step_with_another_layout_of_rotors_is_that_of_jax(layout):
     task = load_task("baseline")

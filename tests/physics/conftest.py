@@ -34,7 +34,7 @@ def fly():
 
         return jax.lax.scan(advance, start, actions)[1]
 
-    def run(vehicle, start, actions, physics_steps=None):
+    def run(vehicle, start, actions, physics_steps=dynamics.PHYSICS_STEPS):
         states = scan(vehicle, start, jax.numpy.asarray(actions, float), physics_steps)
         return dynamics.State(
             **{name: np.stack(getattr(states, name), axis=-1) for name in PARTS},

@@ -256,6 +256,6 @@ def test_a_hovering_vehicle_is_at_rest_with_its_rotors_at_hover_speed(paper):
 
 def test_more_physics_steps_describe_the_same_flight(paper, fly):
     actions = np.random.default_rng(4).uniform(-0.5, 0.5, (50, 4))
-    coarse, fine = (fly(paper, state(paper, **TUMBLE), actions, n) for n in (None, 4))
+    coarse, fine = (fly(paper, state(paper, **TUMBLE), actions, n) for n in (1, 4))
     np.testing.assert_allclose(coarse.position, fine.position, atol=1e-4)
     np.testing.assert_allclose(coarse.attitude, fine.attitude, atol=1e-4)

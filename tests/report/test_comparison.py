@@ -228,6 +228,7 @@ def test_a_place_that_cannot_be_written_is_refused(make_flown, tmp_path):
 # --- a browser ---
 
 
+@pytest.mark.slow
 @pytest.mark.browser
 @pytest.mark.parametrize(("controllers", "width"), [(2, 1200), (6, 900), (6, 400)])
 def test_a_browser_draws_every_figure_with_nothing_misplaced(browser, six, tmp_path, controllers, width):

@@ -248,6 +248,7 @@ def test_a_browser_draws_every_figure_without_an_error_or_a_request(browser, mak
     assert look_at(browser, tmp_path / "report.html") == 4 + 2 * 6
 
 
+@pytest.mark.slow
 @pytest.mark.browser
 def test_a_browser_draws_the_odd_cases_too(browser, odd_evaluations, tmp_path):
     evaluations = [dataclasses.replace(evaluation, name=odd) for odd, evaluation in odd_evaluations.items()]

@@ -12,6 +12,8 @@ from flytune.errors import BadInput, Diverged
 from flytune.task.files import load_task
 from flytune.training.loop import train
 
+pytestmark = pytest.mark.slow
+
 SMALL = SMALL_APG | SMALL_PPO | {"apg.updates": 2, "ppo.steps": 128}  # two updates, and one program for all
 PARTS = ("target", "initial_state", "noise", "reward", "termination")
 

@@ -219,6 +219,7 @@ def test_the_kernel_and_jax_learn_the_same(small_task, monkeypatch, apart, final
     assert np.median(np.abs(change)) > 1e-2  # else the above says little
 
 
+@pytest.mark.slow
 def test_an_update_works_without_kernels_with_an_odd_batch_and_in_a_trace(small_task, monkeypatch):
     monkeypatch.setenv("FLYTUNE_KERNELS", "0")
     settings = dataclasses.replace(small_task.ppo, environments=3, rollout=8, minibatch=12, epochs=3)
@@ -230,6 +231,7 @@ def test_an_update_works_without_kernels_with_an_odd_batch_and_in_a_trace(small_
     assert after.episodes.steps.shape == (3,)
 
 
+@pytest.mark.slow
 def test_several_seeds_as_one_batch_learn_as_each_alone(small_task):
     keys = jax.random.split(jax.random.key(0), 2)
     start, update = (functools.partial(each, small_task, small_task.ppo) for each in (ppo.start, ppo.update))

@@ -50,6 +50,7 @@ def test_a_directory_that_holds_a_run_is_refused_and_kept(tmp_path):
     assert (tmp_path / "run.json").read_text() == "{}"
 
 
+@pytest.mark.slow
 def test_a_tuning_is_resumed_only_with_the_same_arguments(tmp_path):
     with pytest.raises(BadInput, match="holds no tuning"):
         tune(3.0, out=tmp_path / "none", resume=True)
@@ -111,6 +112,7 @@ def test_a_failed_validation_set_joins_the_training_set_and_a_resumed_tuning_inc
     assert [each.seed for each in again.validations] == [each.seed for each in result.validations]
 
 
+@pytest.mark.slow
 def test_an_iteration_that_diverges_is_not_edited_further(tmp_path):
     # a gradient of 5e18 has a finite square in float32, nine times as much has not
     (tmp_path / "stiff.toml").write_text('based_on = "baseline"\n[reward.smoothness]\nweight = 3e20\n')
@@ -128,6 +130,7 @@ def test_an_iteration_that_diverges_is_not_edited_further(tmp_path):
     assert (again.iterations, again.validations) == (result.iterations, result.validations)
 
 
+@pytest.mark.slow
 def test_a_tuning_that_ended_without_success_stays_as_it_is_when_resumed(tmp_path):
     rules = [rule for rule in RULES if rule.name == "H6 faster"]
     fixed = {"apg.updates": 1}

@@ -12,6 +12,7 @@ from flytune.physics.rotors import commanded_rotor_speed, hover_action, thrust_a
 from flytune.physics.vehicle import TrueVehicle, Vehicle
 
 CONTROL_PERIOD = 0.01  # s; the paper's (R6), and the longest physics step
+PHYSICS_STEPS = 1  # per control period
 RAD_PER_S = 2 * math.pi / 60  # of one rpm
 
 
@@ -25,15 +26,6 @@ class State:
     body_rate: Components  # 3, rad/s, body frame
     rotor_speed_rpm: Components  # 4, rpm
     pending_actions: Float[Array, "latency 4"]  # actions on their way to the motors, oldest first
-
-
-def least_physics_steps(vehicle: Vehicle) -> int:
-    """The physics steps of a control period: one up to 0.01 s.
-
-    Forces and attitude are also evaluated at the middle of a step. More steps are not more accurate in float32
-    (docs/concepts/integrator.md).
-    """
-    return math.ceil(vehicle.control_period / CONTROL_PERIOD - 1e-9)
 
 
 def hovering(vehicle: Vehicle, position: Components, attitude: Components = (0.0, 0.0, 0.0, 1.0)) -> State:
@@ -137,7 +129,7 @@ def rotor_speed_after(vehicle: Vehicle, now: Components, commanded: Components, 
     )
 
 
-def step(vehicle: Vehicle, state: State, action: Float[Array, "4"], physics_steps: int | None = None) -> State:
+def step(vehicle: Vehicle, state: State, action: Float[Array, "4"], physics_steps: int = PHYSICS_STEPS) -> State:
     """The state one control period later, under one action in [-1, 1]^4.
 
     The motors receive the action after the latency.
@@ -146,9 +138,12 @@ def step(vehicle: Vehicle, state: State, action: Float[Array, "4"], physics_step
         vehicle: its numbers.
         state: the state now.
         action: of each motor.
-        physics_steps: of the control period; `least_physics_steps` where None.
+        physics_steps: of the control period, and as many more as keep each of them at 0.01 s or less.
+
+    Forces and attitude are also evaluated at the middle of a step. More steps are not more accurate in float32
+    (docs/concepts/integrator.md).
     """
-    physics_steps = physics_steps or least_physics_steps(vehicle)
+    physics_steps = max(physics_steps, math.ceil(vehicle.control_period / CONTROL_PERIOD - 1e-9))
     queue = jnp.concatenate([state.pending_actions, action[None]])
     commanded = tuple(commanded_rotor_speed(vehicle, motor) for motor in unpack(queue[0]))
     body = (state.position, state.attitude, state.velocity, state.body_rate)

@@ -12,7 +12,7 @@ from flytune.config.document import Whole
 from flytune.config.pytree import pytree, static
 from flytune.kernels.programs import program
 from flytune.physics import dynamics
-from flytune.physics.dynamics import State
+from flytune.physics.dynamics import PHYSICS_STEPS, State
 from flytune.physics.rotors import hover_action
 from flytune.physics.vehicle import Vehicle
 from flytune.simulation.environment import Physics
@@ -23,8 +23,7 @@ from flytune.simulation.simulator import VehicleStates, state_from, state_number
 class JaxSimulatorOptions:
     """How finely the physics is stepped."""
 
-    # None: steps of up to 0.01 s
-    physics_steps: Annotated[Whole | None, Ge(1), Le(100), Unit("per control period")] = static(default=None)
+    physics_steps: Annotated[Whole, Ge(1), Le(100), Unit("per control period")] = static(default=PHYSICS_STEPS)
 
 
 class JaxSimulator:
@@ -64,8 +63,8 @@ def _hovering(vehicle: Vehicle) -> jax.Array:
 
 
 @lru_cache  # the same function for the same number, so that one compiled program serves every simulator
-def _physics(physics_steps: int | None) -> Physics:
-    return dynamics.step if physics_steps is None else partial(dynamics.step, physics_steps=physics_steps)
+def _physics(physics_steps: int) -> Physics:
+    return dynamics.step if physics_steps == PHYSICS_STEPS else partial(dynamics.step, physics_steps=physics_steps)
 
 
 @partial(jax.jit, static_argnums=0)
