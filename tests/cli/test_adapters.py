@@ -47,6 +47,7 @@ def test_an_option_of_a_simulator_changes_the_flight(folder):
     assert damped["peak_speed"]["median"] < 0.99 * plain["peak_speed"]["median"]
 
 
+@pytest.mark.slow
 @pytest.mark.floor
 def test_an_exported_policy_flies_as_the_run_it_came_from(folder):
     pytest.importorskip("onnxruntime", reason="needs flytune[onnx]")

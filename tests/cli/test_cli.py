@@ -35,10 +35,12 @@ def run(folder):
     return lines[-1]
 
 
+@pytest.mark.slow
 def test_a_second_training_without_out_gets_a_number_of_its_own(folder, run):
     assert flytune("train", "baseline", "--set", *SMALL, cwd=folder).stdout.splitlines()[-1] == f"{run}-2"
 
 
+@pytest.mark.slow
 def test_a_training_with_other_settings_gets_another_name_and_one_without_changes_has_no_digits(folder, run):
     other = flytune("train", "baseline", "--set", *SMALL, "apg.updates=1", cwd=folder).stdout.splitlines()[-1]
     assert other != run and re.fullmatch(r"runs/baseline-apg-s0-[0-9a-f]{6}", other)

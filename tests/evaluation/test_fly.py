@@ -375,6 +375,7 @@ def test_a_policy_that_ships_does_the_same_at_every_heading(name):
     assert np.median(here) == pytest.approx(np.median(there), rel=0.1)
 
 
+@pytest.mark.slow
 def test_a_far_target_is_approached_by_a_policy_and_not_crashed_into():
     task = load_task("dial").at()
     starts = InitialState(

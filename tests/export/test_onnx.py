@@ -55,6 +55,7 @@ def exported(policy, tmp_path):
     return tmp_path / "policy.onnx"
 
 
+@pytest.mark.slow
 def test_the_file_gives_the_actions_of_the_policy_for_ten_thousand_observations_every_squash_and_size(tmp_path):
     observations = sample_observations(10_000)
     sizes = [((), "tanh"), ((8,), "clip"), ((64, 64), "clip"), ((64, 64), "tanh"), ((32, 16, 8), "tanh")]

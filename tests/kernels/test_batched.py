@@ -163,6 +163,7 @@ def _compare(task):
             np.testing.assert_allclose(one, other, rtol=1e-4, atol=1e-4 * (1 + float(jnp.max(jnp.abs(other)))))
 
 
+@pytest.mark.slow
 def test_the_gradient_with_respect_to_the_shared_numbers_is_that_of_jax():
     task = load_task("baseline")
     episodes, actions, keys = situation(task)

@@ -69,6 +69,7 @@ def by_hand(given):
     return states, [np.stack(record) for record in records]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("threads", [1, 2])
 def test_two_learners_learn_as_step_by_step_in_jax(given, threads):
     found, wanted = run(given, threads), by_hand(given)

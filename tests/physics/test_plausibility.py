@@ -38,7 +38,13 @@ SLIPS = {  # the unit that is named -> the numbers as they are in that unit
 }  # fmt: skip
 # the propeller radius of gym-pybullet-drones' racer is twice that of its propeller, so that inches look like cm
 AMBIGUOUS = {("racer of ten inches", slip) for slip in SLIPS if "write propeller_radius" in slip}
-CASES = [(name, slip) for name in TABLES for slip in SLIPS if (name, slip) not in AMBIGUOUS]
+FEW = ("crazyflie", "racer", "lifter")
+CASES = [
+    pytest.param(name, slip, marks=[pytest.mark.slow] * (name not in FEW))
+    for name in TABLES
+    for slip in SLIPS
+    if (name, slip) not in AMBIGUOUS
+]
 
 
 def scaled(table, factors):

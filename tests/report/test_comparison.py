@@ -171,6 +171,7 @@ def test_a_difference_is_written_with_its_sign(value, text):
     assert signed(value) == text
 
 
+@pytest.mark.slow
 def test_the_page_loads_nothing_from_the_network(read, six):
     page = read(*six)
     assert not {tag for tag, _ in page.elements} & {"link", "img", "iframe", "object", "embed", "base", "source"}
@@ -181,6 +182,7 @@ def test_the_page_loads_nothing_from_the_network(read, six):
     assert policy.startswith("default-src 'none';")
 
 
+@pytest.mark.slow
 def test_names_that_are_markup_come_out_as_text(read, six):
     page = read(*six)
     assert len([tag for tag, _ in page.elements if tag == "script"]) == len(page.figures) + 2

@@ -257,6 +257,7 @@ def test_a_browser_draws_the_odd_cases_too(browser, odd_evaluations, tmp_path):
     assert look_at(browser, tmp_path / "report.html") == 1 + 6 * len(evaluations) - 6
 
 
+@pytest.mark.slow
 @pytest.mark.browser
 def test_a_browser_shows_hostile_names_as_text(browser, hostile_evaluation, tmp_path):
     write_report(tmp_path / "report.html", [hostile_evaluation, hostile_evaluation])
@@ -267,6 +268,7 @@ def test_a_browser_shows_hostile_names_as_text(browser, hostile_evaluation, tmp_
     )
 
 
+@pytest.mark.slow
 @pytest.mark.browser
 def test_the_page_offers_no_upload_and_fits_a_narrow_window(browser, make_evaluation, tmp_path):
     write_report(tmp_path / "report.html", [make_evaluation(), make_evaluation(name="y" * 200)])

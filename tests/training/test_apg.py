@@ -24,6 +24,7 @@ def train_state(small_task):
     return apg.start(small_task, small_task.apg, jax.random.key(0))
 
 
+@pytest.mark.slow
 def test_the_gradient_agrees_with_finite_differences_of_the_flown_reward(small_task, train_state):
     shape = (small_task.apg.window, small_task.apg.environments)
     noise, keys = (jax.random.split(jax.random.key(seed), shape) for seed in (1, 2))

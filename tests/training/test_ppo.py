@@ -152,6 +152,7 @@ def test_the_learning_rate_falls_along_a_line_to_its_last_share(small_task):
     np.testing.assert_allclose(lengths, [1.0, 0.6, 0.2, 0.2], rtol=0.01)
 
 
+@pytest.mark.slow
 def test_the_policy_multiplies_what_it_sees_with_what_it_was_trained_on(small_task):
     settings = dataclasses.replace(small_task.ppo, input_scale=(2.0, 3.0, 4.0, 5.0, 6.0))
     train_state = ppo.start(small_task, settings, jax.random.key(0))
@@ -192,6 +193,7 @@ def test_ppo_learns_to_survive_and_to_earn_more_within_half_a_million_steps():
     assert float(last["reward"]) > float(first["reward"]) + 0.05
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("apart", [False, True])
 @pytest.mark.parametrize("final_learning_rate", [1.0, 0.1])
 def test_the_kernel_and_jax_learn_the_same(small_task, monkeypatch, apart, final_learning_rate):

@@ -40,6 +40,7 @@ def heavier(small_task):
     return dataclasses.replace(small_task, vehicle=vehicle, ppo=ppo, apg=apg)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("trainer", ["apg", "ppo"])
 def test_a_training_on_another_task_begins_with_the_actions_of_the_policy(runs, heavier, trainer):
     method, start = find_trainer(trainer), find_warm_start(runs[trainer])

@@ -25,6 +25,7 @@ def test_a_requirement_that_the_dial_covers_starts_with_a_policy_that_meets_it(t
     assert (start.judgement.trials, start.judgement.duration >= 2.5 * time) == (100, True)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("time", "name"), [(1.5, "dial"), (14.0, "dial"), (3.0, "baseline-refined")])
 def test_elsewhere_it_is_the_known_task_that_settles_nearest(time, name):
     # a bound on speed cannot be set in the task with a dial, which the bound follows
