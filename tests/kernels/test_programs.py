@@ -7,6 +7,8 @@ import sys
 
 import pytest
 
+pytestmark = pytest.mark.slow
+
 SCRIPT = """
 import dataclasses, json, sys
 import jax, jax.numpy as jnp, numpy as np

@@ -16,6 +16,8 @@ from flytune.reproduction.page import html, markdown, summary
 from flytune.reproduction.study import BEHAVIOURS
 from flytune.reproduction.verdict import JudgedClaim, Measure
 
+pytestmark = pytest.mark.slow
+
 ORDERED = {"baseline": 1.0, "acrobatic": 0.5, "inspection": 1.5}
 LABELS = {  # what each figure must say
     "reward": "episode reward",

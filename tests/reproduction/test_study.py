@@ -16,6 +16,8 @@ from flytune.reproduction.trainings import train_all
 from flytune.runs.directory import CHECKPOINT
 from flytune.training.loop import train
 
+pytestmark = pytest.mark.slow
+
 STEPS = 3 * 16_384  # three updates
 
 
