@@ -20,7 +20,8 @@ def cells(judgement: Judgement) -> list[str]:
     found = judgement.to_dict()
     settled = "/".join(str(found["axes"][axis]["settled"]) for axis in ("x", "y", "z", "yaw"))
     settling, error = (found["position"][name]["median"] for name in ("settling_time", "steady_state_error"))
-    return [settled, "-" if settling is None else f"{settling:.2f} s", "-" if error is None else f"{1000 * error:.1f} mm"]
+    shown = "-" if error is None else f"{1000 * error:.1f} mm"
+    return [settled, "-" if settling is None else f"{settling:.2f} s", shown]
 
 
 def main() -> None:
