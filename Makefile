@@ -85,7 +85,7 @@ PIN := $(BIN)/pip-compile --quiet --generate-hashes --allow-unsafe --strip-extra
 EXTRAS := $(foreach extra,build dev docs gymnasium mujoco onnx optuna pybullet tensorboard,--extra $(extra))
 pins:
 	$(PIN) --extra build -o requirements/base.txt pyproject.toml
-	$(PIN) $(EXTRAS) -c requirements/base.txt -o requirements/dev.txt pyproject.toml
+	$(PIN) $(EXTRAS) -c requirements/base.txt -c requirements/limits.txt -o requirements/dev.txt pyproject.toml
 	rm -rf build/sb3 && $(BIN)/python -m pip download --quiet --no-deps -d build/sb3 stable-baselines3
 	cd build/sb3 && for file in *.whl; do echo "$$file" | sed -E 's/_/-/; s/-py3.*/ \\/; s/-([0-9.]+ )/==\1/' && \
 		sha256sum "$$file" | sed -E 's/ .*//; s/^/    --hash=sha256:/'; done > ../../requirements/sb3.txt
